@@ -1,0 +1,533 @@
+"""The command line: options in, one call into the library, an exit code out. The only place that ends the process.
+
+Exit codes: 0 done, 1 something failed, 2 wrong use, 130 interrupted. Data goes to stdout, everything else to stderr.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+
+import click
+
+from semslam import __version__
+from semslam.errors import SemslamError, UsageError
+from semslam.pipeline.threads import ONE_THREAD
+
+if TYPE_CHECKING:
+    from semslam.pipeline.config import Config
+    from semslam.pipeline.console import Console
+    from semslam.stages.contract import Stage
+
+INTERRUPTED = 130
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+_MODEL_OPTIONS = ("detector", "classes", "segmenter_encoder", "segmenter_decoder")
+
+
+def main(arguments: Sequence[str] | None = None, stages: Sequence[Stage] | None = None) -> NoReturn:
+    """Run the command line and exit; `stages` replaces the catalogue."""
+    os.environ.update(ONE_THREAD)  # before numpy is imported, which reads them once
+    signal.signal(signal.SIGTERM, _interrupt)
+    sys.exit(_guarded(arguments, stages))
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _guarded(arguments: Sequence[str] | None, stages: Sequence[Stage] | None) -> int:
+    """Run, and turn whatever is thrown into a message and an exit code."""
+    try:
+        result = cli.main(arguments, prog_name="semslam", standalone_mode=False, obj=stages)
+        return result if isinstance(result, int) else 0
+    except (KeyboardInterrupt, click.Abort):
+        _complain("interrupted: run the same command again to resume")
+        return INTERRUPTED
+    except SemslamError as error:
+        _console().error(error)
+        return error.exit_code
+    except click.ClickException as error:
+        _console().error(UsageError(error.format_message(), hint=_click_hint(error)))
+        return 2
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nobody reads; nothing is left to say
+        return 1
+    except OSError as error:
+        from semslam.pipeline.files import out_of_space
+
+        what = "No space left" if out_of_space(error) else error.strerror or str(error)
+        where = f": `{error.filename}`" if error.filename else ""
+        _console().error(SemslamError(f"{what}{where}", hint="free some space or check the permissions"))
+        return 1
+
+
+def _click_hint(error: click.ClickException) -> str:
+    context = error.ctx if isinstance(error, click.UsageError) else None
+    return f"`{context.command_path if context else 'semslam'} --help` shows how"
+
+
+def _complain(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _console(*, quiet: bool = False) -> Console:
+    from semslam.pipeline.console import Console
+
+    return Console(quiet=quiet)
+
+
+def _print(value: Any, as_json: bool) -> None:
+    """Data: its text for people, or its JSON for machines."""
+    click.echo(json.dumps(value.as_json(), indent=1, ensure_ascii=False) if as_json else value.text())
+
+
+def _stages(context: click.Context) -> tuple[Stage, ...]:
+    from semslam.stages.catalogue import STAGES
+
+    return tuple(context.find_root().obj or STAGES)
+
+
+def _applied(command: _Command, options: Sequence[Callable[[_Command], _Command]]) -> _Command:
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def _config_options(command: _Command) -> _Command:
+    """Options that make a configuration."""
+    return _applied(
+        command,
+        (
+            click.option("--config", "config_file", type=click.Path(path_type=Path), help="TOML configuration file."),
+            click.option("--set", "assignments", multiple=True, metavar="KEY=VALUE", help="Set one key; repeatable."),
+            click.option(
+                "--topic", "topics", multiple=True, metavar="ROLE=/TOPIC", help="Topic of a role; repeatable."
+            ),
+            click.option("--detector", type=click.Path(), help="ONNX file of the detector."),
+            click.option("--classes", type=click.Path(), help="Text file with its class names."),
+            click.option("--segmenter-encoder", type=click.Path(), help="ONNX file of the segmenter's image encoder."),
+            click.option("--segmenter-decoder", type=click.Path(), help="ONNX file of the segmenter's mask decoder."),
+            click.option("--estimator", "estimators", multiple=True, metavar="NAME", help="Estimator; repeatable."),
+        ),
+    )
+
+
+def _run_options(command: _Command) -> _Command:
+    """Options of the commands that run stages."""
+    own = (
+        click.argument("logs", nargs=-1, required=True),
+        click.option("--out", type=click.Path(path_type=Path), default=Path("out"), show_default=True, help="Folder."),
+    )
+    end = (
+        click.option("--workers", type=click.IntRange(0), help="Processes; 0: none but this. Default: by processors."),
+        _json_option,
+        click.option("--quiet", is_flag=True, help="Only warnings and errors."),
+    )
+    return _applied(_config_options(_applied(command, end)), own)
+
+
+_json_option = click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")
+_out_argument = click.argument("out", type=click.Path(path_type=Path))
+
+
+def _settings(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The options that stand for configuration keys, as {"section.key": value}."""
+    settings: dict[str, Any] = {
+        f"extract.{name}": os.path.abspath(given[name]) for name in _MODEL_OPTIONS if given.get(name)
+    }
+    for text in given.get("topics", ()):
+        role, equals, topic = text.partition("=")
+        if not (role and equals and topic):
+            raise UsageError(f"`--topic {text}` is not of the form ROLE=/TOPIC", hint="`--topic depth=/camera/depth`")
+        settings[f"ingest.topics.{role}"] = topic
+    if given.get("estimators"):
+        settings["localize.estimators"] = list(given["estimators"])
+    return settings
+
+
+def _run(context: click.Context, until: str, given: Mapping[str, Any]) -> int:
+    """Run the stages up to `until`; the exit code."""
+    from semslam.pipeline.run import RunRequest, run
+
+    request = RunRequest(
+        names=given["logs"],
+        out=given["out"],
+        until=until,
+        command=context.command.name or "run",
+        config_file=given["config_file"],
+        assignments=given["assignments"],
+        options=_settings(given),
+        workers=given["workers"],
+    )
+    outcome = run(request, _stages(context), _console(quiet=given["quiet"]))
+    if given["as_json"]:
+        click.echo(json.dumps(outcome, indent=1, ensure_ascii=False))
+    return int(outcome["exit_code"])
+
+
+class _InOrder(click.Group):
+    """Lists its commands in the order in which people need them."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        """Names as they were added."""
+        return list(self.commands)
+
+
+@click.group(cls=_InOrder, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(__version__, prog_name="semslam", message="%(prog)s %(version)s")
+def cli() -> None:
+    """Pose tracks and semantic maps from MCAP robot logs, offline and in batch.
+
+    \b
+    Example:
+      semslam run kitchen.mcap --detector yolox.onnx --classes coco.txt --out OUT
+    """
+
+
+@cli.command()
+@click.option("--out", type=click.Path(path_type=Path), default=Path("semslam_demo"), show_default=True, help="Folder.")
+@click.option("--workers", type=click.IntRange(0), help="Processes; 0: none but this. Default: by processors.")
+@_json_option
+@click.option("--quiet", is_flag=True, help="Only warnings and errors.")
+@click.pass_context
+def demo(context: click.Context, out: Path, workers: int | None, as_json: bool, quiet: bool) -> int:
+    """Try it on a simulated robot.
+
+    Records half a minute of a small robot in a furnished room and makes its maps. Opens nothing; says where to look.
+
+    \b
+    Example:
+      semslam demo --out semslam_demo
+    """
+    from semslam.pipeline.folder import create_folder
+    from semslam.pipeline.run import RunRequest, run
+    from semslam.sim.demo import demo_settings
+
+    settings = demo_settings()
+    console = _console(quiet=quiet)
+    log = _demo_log(create_folder(out).root / "demo.mcap", console)
+    request = RunRequest([str(log)], out, _stages(context)[-1].name, "demo", options=settings, workers=workers)
+    outcome = run(request, _stages(context), console)
+    if as_json:
+        click.echo(json.dumps(outcome, indent=1, ensure_ascii=False))
+    elif not outcome["exit_code"]:
+        console.say(f"log: {log}\nnext: `semslam evaluate {out}` compares the tracks with the simulated truth")
+    return int(outcome["exit_code"])
+
+
+@cli.command()
+@_run_options
+@click.pass_context
+def run(context: click.Context, /, **given: Any) -> int:
+    """Run everything: ingest, extract, localize, export.
+
+    LOGS are files, folders (searched for *.mcap) or globs. A killed run goes on where it was; what is done is not
+    done again unless its input or configuration changed.
+
+    \b
+    Example:
+      semslam run kitchen.mcap --detector yolox.onnx --classes coco.txt --out OUT
+    """
+    return _run(context, _stages(context)[-1].name, given)
+
+
+@cli.command()
+@_run_options
+@click.option("--check", is_flag=True, help="Only report what the logs hold and whether they will do.")
+@click.pass_context
+def ingest(context: click.Context, /, check: bool, **given: Any) -> int:
+    """Read logs into levelled keyframes and motion.
+
+    LOGS are files, folders or globs.
+
+    \b
+    Example:
+      semslam ingest kitchen.mcap --check
+    """
+    return _check(context, given) if check else _run(context, "ingest", given)
+
+
+@cli.command()
+@_run_options
+@click.pass_context
+def extract(context: click.Context, /, **given: Any) -> int:
+    """Find objects and project them onto the floor.
+
+    Runs what it needs before: ingest.
+
+    \b
+    Example:
+      semslam extract logs/ --detector yolox.onnx --classes coco.txt --out OUT
+    """
+    return _run(context, "extract", given)
+
+
+@cli.command()
+@_run_options
+@click.pass_context
+def localize(context: click.Context, /, **given: Any) -> int:
+    """Estimate poses and maps.
+
+    Runs what it needs before: ingest, extract.
+
+    \b
+    Example:
+      semslam localize logs/ --estimator paper --config home.toml --out OUT
+    """
+    return _run(context, "localize", given)
+
+
+@cli.command()
+@_run_options
+@click.pass_context
+def export(context: click.Context, /, **given: Any) -> int:
+    """Write maps and trajectories as files.
+
+    Runs what it needs before: ingest, extract, localize.
+
+    \b
+    Example:
+      semslam export logs/ --config home.toml --out OUT
+    """
+    return _run(context, "export", given)
+
+
+@cli.command()
+@_out_argument
+@_json_option
+def evaluate(out: Path, as_json: bool) -> None:
+    """Compare all tracks with ground truth.
+
+    Stands beside them: `chance` (random poses) and `standstill` (no motion at all).
+
+    \b
+    Example:
+      semslam evaluate OUT
+    """
+    from semslam.pipeline.evaluate import evaluate_run
+    from semslam.pipeline.folder import open_folder
+
+    evaluation = evaluate_run(open_folder(out))
+    for note in evaluation.notes:
+        _console().warn(note)
+    _print(evaluation, as_json)
+
+
+@cli.command()
+@_out_argument
+@_json_option
+@click.pass_context
+def status(context: click.Context, out: Path, as_json: bool) -> None:
+    """Show what an output folder holds.
+
+    \b
+    Example:
+      semslam status OUT
+    """
+    from semslam.pipeline.folder import open_folder
+    from semslam.pipeline.status import status as look
+
+    _print(look(open_folder(out), _stages(context)), as_json)
+
+
+@cli.command()
+@click.argument("stage")
+@click.argument("log")
+@click.option("--out", type=click.Path(path_type=Path), default=Path("out"), show_default=True, help="Output folder.")
+@_config_options
+@_json_option
+@click.pass_context
+def why(context: click.Context, /, stage: str, log: str, out: Path, as_json: bool, **given: Any) -> None:
+    """Explain why a stage ran, or would run.
+
+    STAGE may name a variant (localize/paper), LOG is a name that `semslam status` shows or a file. Options of
+    `semslam run` that change the configuration may be given; without any, that of the last run counts.
+
+    \b
+    Example:
+      semslam why extract kitchen --out OUT --set extract.min_score=0.4
+    """
+    from semslam.pipeline.folder import open_folder
+    from semslam.pipeline.why import as_json as reasons_json
+    from semslam.pipeline.why import find_record
+    from semslam.pipeline.why import why as explain
+
+    folder = open_folder(out)
+    record = find_record(folder, log)
+    config = _config_like(_stages(context), record.config, f"the record of `{record.name}`", given)
+    reasons = explain(folder, _stages(context), stage, record, config)
+    if as_json:
+        click.echo(json.dumps(reasons_json(record.name, reasons), indent=1, ensure_ascii=False))
+    else:
+        click.echo("\n".join(reason.text() for reason in reasons))
+
+
+def _config_like(stages: Sequence[Stage], recorded: Mapping[str, Any], source: str, given: Mapping[str, Any]) -> Config:
+    """The configuration that the options make, or without any the recorded one."""
+    from semslam.pipeline.config import config_from_json, load_config
+
+    settings = _settings(given)
+    if settings or given["config_file"] or given["assignments"]:
+        return load_config(stages, given["config_file"], given["assignments"], settings)
+    return config_from_json(stages, recorded, source)
+
+
+@cli.command()
+@_out_argument
+@click.option("--rederive", is_flag=True, help="Also make every result again and compare.")
+@click.option("--remove", is_flag=True, help="Remove damaged entries; the next run makes them anew.")
+@click.option("--workers", type=click.IntRange(0), help="Processes for --rederive.")
+@_json_option
+@click.pass_context
+def verify(context: click.Context, out: Path, rederive: bool, remove: bool, workers: int | None, as_json: bool) -> int:
+    """Check everything stored for damage.
+
+    Exit code 1 if anything is damaged, missing or different.
+
+    \b
+    Example:
+      semslam verify OUT --rederive
+    """
+    from semslam.pipeline.folder import open_folder
+    from semslam.pipeline.verify import verify_folder
+
+    report = verify_folder(open_folder(out), _stages(context), _console(), again=rederive, drop=remove, workers=workers)
+    _print(report, as_json)
+    return 0 if report.ok else 1
+
+
+@cli.command()
+@_out_argument
+@click.option("--all", "everything", is_flag=True, help="All entries and records; only results stay.")
+@click.option("--dry-run", is_flag=True, help="Only say what would be removed.")
+@_json_option
+def clean(out: Path, everything: bool, dry_run: bool, as_json: bool) -> None:
+    """Remove what no log refers to any more.
+
+    Entries that no log uses, unfinished work, temporary files, results of logs and variants that are gone.
+
+    \b
+    Example:
+      semslam clean OUT --dry-run
+    """
+    from semslam.pipeline.clean import clean as clean_folder
+    from semslam.pipeline.folder import open_folder
+
+    folder = open_folder(out)
+    with folder.locked():
+        report = clean_folder(folder, everything=everything, dry_run=dry_run)
+    _print(report, as_json)
+
+
+@cli.group()
+def config() -> None:
+    """Show or check a configuration.
+
+    \b
+    Example:
+      semslam config show > home.toml
+    """
+
+
+@config.command("show")
+@_config_options
+@click.option("--defaults", is_flag=True, help="The defaults, whatever else is given.")
+@click.pass_context
+def config_show(context: click.Context, /, defaults: bool, **given: Any) -> None:
+    """Print the whole configuration as TOML, every key documented.
+
+    \b
+    Example:
+      semslam config show --config home.toml --set extract.min_score=0.4
+    """
+    from semslam.pipeline.config import as_toml, load_config
+
+    if defaults:
+        shown = load_config(_stages(context))
+    else:
+        shown = load_config(_stages(context), given["config_file"], given["assignments"], _settings(given))
+    click.echo(as_toml(shown), nl=False)
+
+
+@config.command("check")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.pass_context
+def config_check(context: click.Context, file: Path) -> None:
+    """Check a configuration file: keys, types, ranges, and that the files it names exist.
+
+    \b
+    Example:
+      semslam config check home.toml
+    """
+    from semslam.pipeline.config import check_files, load_config
+
+    check_files(load_config(_stages(context), file))
+    click.echo(f"{file}: ok")
+
+
+@cli.group()
+def models() -> None:
+    """Look at networks.
+
+    \b
+    Example:
+      semslam models inspect yolox.onnx
+    """
+
+
+@models.command("inspect")
+@click.argument("file", type=click.Path(path_type=Path))
+@_json_option
+def models_inspect(file: Path, as_json: bool) -> None:
+    """Show inputs, outputs and metadata of an ONNX file, and what semslam takes it for.
+
+    \b
+    Example:
+      semslam models inspect yolox.onnx
+    """
+    from semslam.models.session import describe
+
+    _print(describe(file), as_json)
+
+
+def _demo_log(path: Path, console: Console) -> Path:
+    """The demo's log, recorded if it is not there yet."""
+    from semslam.pipeline.files import TEMPORARY
+    from semslam.sim.demo import record_demo
+
+    if not path.exists():
+        console.say(f"recording a simulated robot to {path}")
+        record_demo(path.with_name(f"{TEMPORARY}{path.name}")).replace(path)
+    return path
+
+
+def _check(context: click.Context, given: Mapping[str, Any]) -> int:
+    """`ingest --check`: a report and a picture for every log; 1 if one will not do."""
+    from semslam.pipeline.config import load_config
+    from semslam.pipeline.discover import discover
+    from semslam.stages.check import check_log
+
+    stages = _stages(context)
+    resolved = load_config(stages, given["config_file"], given["assignments"], _settings(given))
+    found = discover(given["logs"])
+    explicit = context.get_parameter_source("out") == click.core.ParameterSource.COMMANDLINE
+    beside = given["out"].parent if explicit else Path()
+    reports = [
+        check_log(log.sources, resolved.of(stages[0]).topics, beside / f"{log.name}.check.png") for log in found.logs
+    ]
+    if given["as_json"]:
+        click.echo(json.dumps([report.as_json() for report in reports], indent=1, ensure_ascii=False))
+    else:
+        click.echo("\n\n".join(report.text() for report in reports))
+    for problem in found.problems:
+        _console().error(SemslamError(f"`{problem.path}` was left out: {problem.reason}"))
+    return 0 if all(report.ok for report in reports) and not found.problems else 1
+
+
+if __name__ == "__main__":
+    main()

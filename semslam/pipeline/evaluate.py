@@ -1,0 +1,184 @@
+"""Evaluate: how far every estimator's track is from the truth, beside what luck and standing still score.
+
+Reads   truth, poses       data_spec.md, tables 4 and 7
+Writes  evaluation         data_spec.md, table 11, as OUT/results/evaluation.parquet
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from semslam.errors import SemslamError
+from semslam.metrics import Score, Track, chance, score, standstill
+from semslam.pipeline.cache import EntryIndex, table_files
+from semslam.pipeline.console import table
+from semslam.pipeline.context import check_inputs
+from semslam.pipeline.files import TEMPORARY
+from semslam.pipeline.folder import OutputFolder
+from semslam.pipeline.record import LogRecord, load_records
+from semslam.tables.parquet import TableFiles, write_table
+from semslam.tables.spec import EVALUATION, OBSERVATIONS, POSES, TRUTH, Table
+
+CHANCE = "chance"
+STANDSTILL = "standstill"
+_SEED = 0
+
+
+@dataclass(frozen=True)
+class Line:
+    """One estimator on one log."""
+
+    log: str
+    estimator: str
+    score: Score
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All scores, what could not be scored, and where the table lies."""
+
+    lines: tuple[Line, ...]
+    notes: tuple[str, ...]
+    path: Path
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        scores = [{"log": line.log, "estimator": line.estimator, **asdict(line.score)} for line in self.lines]
+        return {"format": "semslam-evaluation", "version": 1, "scores": scores, "notes": list(self.notes)}
+
+    def text(self) -> str:
+        """For a terminal; with several logs, their mean as well."""
+        head = ["LOG", "ESTIMATOR", "FRAMES", "COVERAGE", "APE", "DE", "WORST APE", "WORST DE"]
+        rows = [_row(line) for line in (*self.lines, *_means(self.lines))]
+        return table([head, *rows], left=(0, 1))
+
+
+def evaluate_run(folder: OutputFolder) -> Evaluation:
+    """Score every estimator on every log that has ground truth.
+
+    Raises:
+        SemslamError: no log has any, or a stored table is damaged.
+    """
+    index = EntryIndex(folder.cache)
+    lines: list[Line] = []
+    notes: list[str] = []
+    for name, record in load_records(folder.logs).items():
+        truth = _track(folder, index, record, TRUTH, "")
+        if truth is None or not len(truth.frames):
+            notes.append(f"`{name}` has no ground truth")
+            continue
+        lines += _score_log(folder, index, record, truth, notes)
+    if not lines:
+        raise SemslamError(
+            f"No log of `{folder.root}` has both ground truth and poses",
+            details="\n".join(notes),
+            hint="name the topic with `semslam run LOG --topic truth=/ground_truth`",
+        )
+    return Evaluation(tuple(lines), tuple(notes), _write(folder, lines))
+
+
+def _score_log(
+    folder: OutputFolder, index: EntryIndex, record: LogRecord, truth: Track, notes: list[str]
+) -> Iterator[Line]:
+    names = [task.partition("/")[2] for task in record.tasks if task.split("/")[0] == POSES.stage]
+    for estimator in names:
+        track = _track(folder, index, record, POSES, estimator)
+        if track is None:
+            notes.append(f"`{record.name}` has no poses of `{estimator}`")
+            continue
+        if _outdated(index, record, estimator):
+            notes.append(f"poses of `{estimator}` for `{record.name}` are older than its observations; run again")
+        yield Line(record.name, estimator, score(truth, track))
+    yield Line(record.name, CHANCE, chance(truth, _map_half_m(record), _SEED))
+    yield Line(record.name, STANDSTILL, standstill(truth))
+
+
+def _track(folder: OutputFolder, index: EntryIndex, record: LogRecord, of: Table, variant: str) -> Track | None:
+    """Poses of a table as a track; None if the log has none."""
+    task = record.tasks.get(f"{of.stage}/{variant}" if variant else of.stage)
+    entry = index.find(of.stage, task.key) if task and task.key else None
+    if entry is None or of.name not in entry.tables:
+        return None
+    files = table_files(folder.stage(of.stage) / entry.key)[of.name]
+    check_inputs(of.name, record.name, files)
+    columns = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")
+    rows = TableFiles(of, [Path(file.path) for file in files]).read(columns)
+    return Track.of(*(rows[column] for column in columns))
+
+
+def _outdated(index: EntryIndex, record: LogRecord, estimator: str) -> bool:
+    """Whether the poses were made from other observations than the log has now."""
+    task, source = record.tasks[f"{POSES.stage}/{estimator}"], record.tasks.get(OBSERVATIONS.stage)
+    entry = index.find(OBSERVATIONS.stage, source.key) if source else None
+    used = task.components.get("inputs", {}).get(OBSERVATIONS.name)
+    return entry is not None and used != entry.tables.get(OBSERVATIONS.name)
+
+
+def _map_half_m(record: LogRecord) -> float:
+    """Half the side of the map that the estimators had, metres."""
+    paper: Mapping[str, Any] = record.config[POSES.stage]["paper"]
+    return float(paper["cell_m"]) * int(paper["map_side"]) / 2
+
+
+def _write(folder: OutputFolder, lines: Sequence[Line]) -> Path:
+    """Store the scores as a table, whole or not at all."""
+    path = folder.results / f"{EVALUATION.name}.parquet"
+    rows = [{"log": line.log, "estimator": line.estimator, **asdict(line.score)} for line in lines]
+    temporary = path.with_name(f"{TEMPORARY}{path.name}-{os.getpid()}")
+    write_table(
+        temporary, EVALUATION, {column.name: [row[column.name] for row in rows] for column in EVALUATION.columns}
+    )
+    temporary.replace(path)
+    return path
+
+
+def _means(lines: Sequence[Line]) -> Iterator[Line]:
+    """The mean over logs of every estimator; logs without a pose lower the coverage only."""
+    if len({line.log for line in lines}) < 2:
+        return
+    for estimator in dict.fromkeys(line.estimator for line in lines):
+        scores = [line.score for line in lines if line.estimator == estimator]
+        yield Line(
+            f"mean of {len(scores)}",
+            estimator,
+            Score(
+                sum(one.frames for one in scores),
+                sum(one.coverage for one in scores) / len(scores),
+                _mean([one.ape_m for one in scores]),
+                _mean([one.de_deg for one in scores]),
+                _most([one.ape_worst_m for one in scores]),
+                _most([one.de_worst_deg for one in scores]),
+            ),
+        )
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+def _most(values: Sequence[float | None]) -> float | None:
+    return max((value for value in values if value is not None), default=None)
+
+
+def _row(line: Line) -> list[str]:
+    one = line.score
+    return [
+        line.log,
+        line.estimator,
+        f"{one.frames:,}",
+        f"{one.coverage:.1%}",
+        *(_metres(one.ape_m), _degrees(one.de_deg), _metres(one.ape_worst_m), _degrees(one.de_worst_deg)),
+    ]
+
+
+def _metres(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f} m"
+
+
+def _degrees(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f} deg"

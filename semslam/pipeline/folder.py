@@ -1,0 +1,158 @@
+"""The output folder: what lies where, whether it may be used, and who is using it.
+
+    OUT/
+      semslam.json                 {"format": "semslam", "version": 1}
+      config.json                  configuration of the last run, resolved
+      logs/<log>.json              sources, configuration, and of each task: key, components, decision, failure
+      logs/<log>.<stage>.traceback.txt   where an unexpected error came from
+      cache/<stage>/<key>/         a finished entry: manifest.json, timing.json, shard-00000/<table>.parquet, ...
+      cache/<stage>/.work-<key>/   the finished shards of an unfinished entry
+      cache/digests.json           digests of input files, by path and stamp
+      cache/index.json             what planning needs of every entry, by the stamp of its manifest
+      results/<log>/<variant>/     the files of the last stage under stable names
+
+Everything under `cache` but the two memories is published by renaming a finished folder and never changed afterwards.
+Both memories may be deleted at any time; they only save reading.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from semslam.errors import SemslamError, UsageError
+from semslam.pipeline.files import TEMPORARY, read_json, write_json
+
+FORMAT = "semslam"
+FORMAT_VERSION = 1
+_MARK = "semslam.json"
+_LOCK = ".lock"
+
+
+@dataclass(frozen=True)
+class OutputFolder:
+    """Paths within an output folder that has been checked."""
+
+    root: Path
+
+    @property
+    def cache(self) -> Path:
+        """Entries of all stages."""
+        return self.root / "cache"
+
+    @property
+    def logs(self) -> Path:
+        """One record a log."""
+        return self.root / "logs"
+
+    @property
+    def results(self) -> Path:
+        """Files for people."""
+        return self.root / "results"
+
+    @property
+    def config(self) -> Path:
+        """Configuration of the last run."""
+        return self.root / "config.json"
+
+    def stage(self, name: str) -> Path:
+        """Entries of one stage."""
+        return self.cache / name
+
+    def busy(self) -> bool:
+        """Whether a run holds the folder now."""
+        try:
+            with self.locked():
+                return False
+        except SemslamError:
+            return True
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the folder for one run; the lock ends with the process, however it ends.
+
+        Raises:
+            SemslamError: another run holds it.
+        """
+        path = self.root / _LOCK
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise _busy(self.root, path) from None
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+            yield
+        finally:
+            os.close(descriptor)
+
+
+def create_folder(root: Path) -> OutputFolder:
+    """Open an output folder, making it if nothing is there.
+
+    Raises:
+        UsageError: it is a file, holds something else, or is of another format version.
+    """
+    if root.exists() and not root.is_dir():
+        raise UsageError(f"`{root}` is a file, not a folder", hint="name another folder with `--out`")
+    if not (root / _MARK).exists():
+        _refuse_foreign(root)
+        root.mkdir(parents=True, exist_ok=True)
+        write_json(root / _MARK, {"format": FORMAT, "version": FORMAT_VERSION}, durable=True)
+    folder = open_folder(root)
+    for path in (folder.cache, folder.logs, folder.results):
+        path.mkdir(exist_ok=True)
+    return folder
+
+
+def open_folder(root: Path) -> OutputFolder:
+    """Open an output folder that exists.
+
+    Raises:
+        UsageError: there is none, or it is of another format version.
+    """
+    mark = root / _MARK
+    if not mark.exists():
+        raise UsageError(
+            f"`{root}` is not an output folder of semslam: it has no `{_MARK}`",
+            hint=f"make one with `semslam run LOG.mcap --out {root}`",
+        )
+    found = read_json(mark)
+    version = found.get("version") if isinstance(found, dict) and found.get("format") == FORMAT else None
+    if version != FORMAT_VERSION:
+        said = f"of format version {version}" if version is not None else f"marked by an unreadable `{_MARK}`"
+        raise UsageError(
+            f"Output folder `{root}` is {said}; this semslam reads version {FORMAT_VERSION}",
+            hint="name another folder with `--out`, or use the version of semslam that wrote it",
+        )
+    return OutputFolder(root)
+
+
+def _refuse_foreign(root: Path) -> None:
+    """An unknown folder with content is not ours to write into."""
+    if not root.exists():
+        return
+    content = sorted(name for name in os.listdir(root) if not name.startswith(TEMPORARY))
+    if content:
+        shown = ", ".join(f"`{name}`" for name in content[:3]) + (", ..." if len(content) > 3 else "")
+        raise UsageError(
+            f"Folder `{root}` is not empty and no output folder of semslam: it holds {shown}",
+            hint=f"name a new folder, such as `--out {root / 'semslam'}`",
+        )
+
+
+def _busy(root: Path, lock: Path) -> SemslamError:
+    try:
+        holder = lock.read_text().strip()
+    except OSError:
+        holder = ""
+    who = f"process {holder}" if holder else "another process"
+    return SemslamError(
+        f"Output folder `{root}` is in use by {who}",
+        hint=f"wait for it to end, stop it with `kill {holder or 'PID'}`, or name another folder with `--out`",
+    )

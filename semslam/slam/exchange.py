@@ -1,0 +1,84 @@
+"""Maps and tracks in the formats of other tools: ROS map_server (YAML and PGM) and TUM trajectories."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semslam.errors import SemslamError
+from semslam.labels import FREE_FLOOR
+from semslam.slam.picture import MapCells
+
+MAX_PIXELS = 1 << 26
+"""Largest PGM that is written, in cells."""
+_OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
+
+
+def occupancy_image(cells: MapCells, unknown: int) -> tuple[NDArray[np.uint8], tuple[float, float]] | None:
+    """Grey values of the map's bounding box, first row on top, and the map frame position of its lower left corner.
+
+    Objects and obstacles are occupied. None if the box has more than `MAX_PIXELS` cells; an empty map is one unknown
+    cell, because map_server refuses pictures without pixels.
+    """
+    if not cells.ix.size:
+        return np.full((1, 1), unknown, np.uint8), (0.0, 0.0)
+    left, low = int(cells.ix.min()), int(cells.iy.min())
+    columns, rows = int(cells.ix.max()) - left + 1, int(cells.iy.max()) - low + 1
+    if columns * rows > MAX_PIXELS:
+        return None
+    image = np.full((rows, columns), unknown, np.uint8)
+    image[cells.iy - low, cells.ix - left] = np.where(cells.class_id == FREE_FLOOR, _FREE, _OCCUPIED)
+    return np.ascontiguousarray(image[::-1]), (left * cells.cell_m, low * cells.cell_m)
+
+
+def unknown_grey(free_threshold: float, occupied_threshold: float) -> int:
+    """The grey value that map_server reads as unknown: 205 by custom, if these thresholds allow it.
+
+    map_server takes (255 - grey) / 255 for the occupancy; below `free_threshold` it is free, above
+    `occupied_threshold` occupied. With 205 that is 0.196, so any free threshold above that would turn everything
+    unknown into free floor; the value in the middle between the thresholds is written then.
+
+    Raises:
+        SemslamError: no grey value lies between the thresholds.
+    """
+    middle = round(255 * (1 - (free_threshold + occupied_threshold) / 2))
+    for grey in (_UNKNOWN, middle):
+        if free_threshold <= (255 - grey) / 255 <= occupied_threshold:
+            return grey
+    raise SemslamError(
+        f"`export.free_threshold` is {free_threshold:g} and `export.occupied_threshold` is {occupied_threshold:g}, "
+        "which leaves nothing between them for unknown cells",
+        hint="set `export.free_threshold` to 0.196 and `export.occupied_threshold` to 0.65",
+    )
+
+
+def pgm(image: NDArray[np.uint8]) -> bytes:
+    """A binary PGM file."""
+    rows, columns = image.shape
+    return f"P5\n{columns} {rows}\n255\n".encode() + image.tobytes()
+
+
+def map_yaml(image: str, cell_m: float, corner_m: tuple[float, float], occupied: float, free: float) -> str:
+    """The YAML file of map_server beside the picture `image`."""
+    return (
+        f"image: {image}\n"
+        f"mode: trinary\n"
+        f"resolution: {cell_m:.6f}\n"
+        f"origin: [{corner_m[0]:.6f}, {corner_m[1]:.6f}, 0.0]\n"
+        f"negate: 0\n"
+        f"occupied_thresh: {occupied:g}\n"
+        f"free_thresh: {free:g}\n"
+    )
+
+
+def tum(poses: Iterable[tuple[int, float, float, float]]) -> str:
+    """Lines `seconds x y z qx qy qz qw` from (stamp_nanos, x_m, y_m, heading_rad); all nine decimals of the stamps."""
+    lines = []
+    for stamp_nanos, x, y, heading in poses:
+        seconds, nanos = divmod(stamp_nanos, 1_000_000_000)
+        turn = f"{math.sin(heading / 2):.12f} {math.cos(heading / 2):.12f}"
+        lines.append(f"{seconds}.{nanos:09d} {x:.9f} {y:.9f} 0.000000000 0.000000000000 0.000000000000 {turn}\n")
+    return "".join(lines)

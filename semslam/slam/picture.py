@@ -1,0 +1,48 @@
+"""What a map picture shows: cells and a path, as plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semslam.labels import FIRST_OBJECT
+
+
+@dataclass(frozen=True)
+class MapCells:
+    """The cells of a map and what they were made with."""
+
+    ix: NDArray[np.int64]
+    iy: NDArray[np.int64]
+    class_id: NDArray[np.int64]
+    classes: tuple[str, ...]
+    cell_m: float
+
+    def objects(self) -> list[int]:
+        """Object classes on the map, most cells first, then by class id."""
+        present, counts = np.unique(self.class_id[self.class_id >= FIRST_OBJECT], return_counts=True)
+        return [int(class_id) for class_id in present[np.lexsort((present, -counts))]]
+
+    def count(self, class_id: int) -> int:
+        """Cells of a class."""
+        return int(np.count_nonzero(self.class_id == class_id))
+
+
+@dataclass(frozen=True)
+class Path:
+    """Positions by keyframe, map frame; NaN where a keyframe has no pose."""
+
+    x_m: NDArray[np.float64]
+    y_m: NDArray[np.float64]
+
+    @property
+    def posed(self) -> NDArray[np.float64]:
+        """(N, 2): the positions that are known."""
+        return np.stack([self.x_m, self.y_m], 1)[~np.isnan(self.x_m)]
+
+    @property
+    def length_m(self) -> float:
+        """From known position to known position."""
+        return float(np.hypot(*np.diff(self.posed, axis=0).T).sum())

@@ -1,0 +1,60 @@
+"""All stages, in the order of the data: the whole architecture on one page. Imports no stage.
+
+A variant of a stage (an estimator of `localize`) is a task of its own with an entry of its own in the cache.
+"""
+
+from __future__ import annotations
+
+from semslam.stages.contract import Stage
+from semslam.stages.settings import ExportConfig, ExtractConfig, IngestConfig, LocalizeConfig
+from semslam.tables.spec import (
+    CELLS,
+    DETECTIONS,
+    FRAMES,
+    MOTION,
+    OBSERVATIONS,
+    POSES,
+    SNAPSHOTS,
+    TOPICS,
+    TRAJECTORY,
+    TRUTH,
+)
+
+INGEST = Stage(
+    "ingest",
+    version=1,
+    config=IngestConfig,
+    reads=(),
+    writes=(TOPICS, FRAMES, MOTION, TRUTH),
+    entry="semslam.stages.ingest:run",
+    from_log=True,
+    optional=(TRUTH,),
+)
+EXTRACT = Stage(
+    "extract",
+    version=1,
+    config=ExtractConfig,
+    reads=(FRAMES,),
+    writes=(DETECTIONS, OBSERVATIONS),
+    entry="semslam.stages.extract:run",
+)
+LOCALIZE = Stage(
+    "localize",
+    version=1,
+    config=LocalizeConfig,
+    reads=(MOTION, OBSERVATIONS),
+    writes=(POSES, SNAPSHOTS, CELLS),
+    entry="semslam.stages.localize:run",
+    variants="estimators",
+)
+EXPORT = Stage(
+    "export",
+    version=1,
+    config=ExportConfig,
+    reads=(POSES, CELLS),
+    writes=(TRAJECTORY,),
+    entry="semslam.stages.export:run",
+    unit="file",
+)
+
+STAGES: tuple[Stage, ...] = (INGEST, EXTRACT, LOCALIZE, EXPORT)

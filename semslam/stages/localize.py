@@ -1,0 +1,196 @@
+"""Localize: from observations and motion to a pose track and maps, with the estimator that the variant names.
+
+Reads   motion         data_spec.md, table 3
+        observations   data_spec.md, table 6
+Writes  poses          data_spec.md, table 7
+        snapshots      data_spec.md, table 8: the estimator's own map, or the map of cells so far if it keeps none
+        cells          data_spec.md, table 9: the map of the whole log, in the last shard
+Paper   equations 2 to 7 and 10
+
+A step needs all steps before it. Each shard therefore keeps the state after its last keyframe (`state.npz`), and a run
+that goes on takes up the state of the last finished shard: the bytes are those of an undisturbed run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from semslam.errors import SemslamError
+from semslam.geometry.frames import SE2
+from semslam.geometry.grid import Planes, to_dense, to_sparse
+from semslam.labels import UNOBSERVED
+from semslam.slam.checkpoint import as_array, pack, unpack
+from semslam.slam.estimator import Belief, Estimator, PoseEstimate, Step
+from semslam.slam.evidence import Evidence, Snapshot
+from semslam.slam.registry import open_estimator
+from semslam.stages.contract import FinishedShard, ShardWriter, StageContext, TableSource, row_shards
+from semslam.stages.settings import LocalizeConfig
+from semslam.tables.spec import CELLS, MOTION, OBSERVATIONS, POSES, SNAPSHOTS
+
+_STATE = "state.npz"
+
+
+def run(ctx: StageContext) -> None:
+    """Step through all keyframes, shard by shard."""
+    motion, observations = ctx.read(MOTION), ctx.read(OBSERVATIONS)
+    track = _Track(ctx, observations.meta)
+    if ctx.finished:
+        track.restore(ctx.finished[-1])
+    for index, start, stop in row_shards(motion.rows, ctx.config.shard_frames):
+        if index < len(ctx.finished):
+            continue
+        with ctx.shard(index) as shard:
+            tables = {table.name: shard.table(table, track.meta) for table in (POSES, SNAPSHOTS, CELLS)}
+            for done, step in enumerate(_steps(motion, observations, track.shape, start, stop), start + 1):
+                tables["poses"].append(_pose_row(step, track.step(step, shard)))
+                if done % ctx.config.snapshot_every == 0 or done == motion.rows:
+                    tables["snapshots"].append(_snapshot_row(step, track.snapshot()))
+                ctx.progress(done, motion.rows)
+            if stop == motion.rows:
+                tables["cells"].append(track.cells())
+            shard.path(_STATE).write_bytes(track.state())
+
+
+class _Track:
+    """An estimator and the map that grows along its poses."""
+
+    def __init__(self, ctx: StageContext, meta: Mapping[str, Any]) -> None:
+        config: LocalizeConfig = ctx.config
+        self._classes = tuple(meta["classes"])
+        self._cell_m, self._side = float(meta["cell_m"]), int(meta["side"])
+        self._estimator: Estimator = open_estimator(ctx.variant, config, self._classes, self._cell_m, self._side)
+        self._evidence = Evidence(self._cell_m, self._side)
+        self._last = SE2(0.0, 0.0, 0.0)
+        self.meta = {"classes": list(self._classes), "cell_m": self._cell_m, "estimator": ctx.variant}
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Of an observation."""
+        return len(self._classes), self._side, self._side
+
+    def step(self, step: Step, shard: ShardWriter) -> PoseEstimate:
+        """Estimate the pose, then lay the observation on the map there."""
+        estimate = self._estimator.step(step)
+        shard.count(f"poses_{estimate.source}")
+        if estimate.map_from_robot is None:
+            return estimate
+        self._last = estimate.map_from_robot
+        if step.observation is not None and not self._evidence.add(step.observation, self._last, step.stamp_nanos):
+            shard.count("observations_off_the_map")
+        return estimate
+
+    def snapshot(self) -> Snapshot:
+        """The estimator's own map, or the cells about the last pose."""
+        belief = self._estimator.belief()
+        return _sparse(belief) if belief else self._evidence.snapshot(self._last)
+
+    def cells(self) -> dict[str, Any]:
+        """Columns of the cells table."""
+        cells = self._evidence.cells()
+        centres = {f"{axis}_m": (cells[f"i{axis}"] + 0.5) * self._cell_m for axis in "xy"}
+        labels = [self._classes[class_id] for class_id in cells["class_id"]]
+        return {**cells, **centres, "label": labels}
+
+    def state(self) -> bytes:
+        """Estimator, map and last pose."""
+        last = np.array([self._last.x_m, self._last.y_m, self._last.heading_rad])
+        parts = {"estimator": self._estimator.state(), "evidence": self._evidence.state()}
+        return pack({**{name: as_array(part) for name, part in parts.items()}, "last": last})
+
+    def restore(self, shard: FinishedShard) -> None:
+        """Go on after a finished shard."""
+        arrays = unpack((shard.folder / _STATE).read_bytes())
+        self._estimator.restore(arrays["estimator"].tobytes())
+        self._evidence.restore(arrays["evidence"].tobytes())
+        self._last = SE2(*arrays["last"].tolist())
+
+
+def _steps(
+    motion: TableSource, observations: TableSource, shape: tuple[int, int, int], start: int, stop: int
+) -> Iterator[Step]:
+    """Motion rows [start, stop), each with the observation of its frame if there is one."""
+    rows = _rows(motion, start, stop)
+    first = next(rows, None)
+    if first is None:
+        return
+    frames = np.array(observations.read(["frame"])["frame"], np.int64)
+    sights = _rows(observations, int(np.searchsorted(frames, first["frame"])), None)
+    sight = next(sights, None)
+    for row in (first, *rows):
+        observation = None
+        if sight and sight["frame"] == row["frame"]:
+            observation, sight = _planes(sight, shape), next(sights, None)
+        yield Step(row["frame"], row["stamp_nanos"], observation, _motion(row))
+
+
+def _rows(table: TableSource, start: int, stop: int | None) -> Iterator[dict[str, Any]]:
+    for batch in table.batches(start=start, stop=stop):
+        for values in zip(*batch.values(), strict=True):
+            yield dict(zip(batch, values, strict=True))
+
+
+def _motion(row: Mapping[str, Any]) -> SE2 | None:
+    """u_t, or None if any part of it is unknown or no number."""
+    parts = (row["dx_m"], row["dy_m"], row["dheading_rad"])
+    return SE2(*parts) if all(part is not None and np.isfinite(part) for part in parts) else None
+
+
+def _planes(row: Mapping[str, Any], shape: tuple[int, int, int]) -> Planes:
+    """The observation as planes; *unobserved* is 1 exactly where nothing else is, whether the table says so or not.
+
+    Raises:
+        SemslamError: an entry lies outside the observation.
+    """
+    try:
+        planes = to_dense(np.array(row["cells"], np.uint32), np.array(row["weights"], np.float32), shape)
+    except IndexError as error:
+        raise SemslamError(
+            f"Observation of frame {row['frame']} has a cell outside its {shape[0]} x {shape[1]} x {shape[2]} grid",
+            hint="`semslam verify OUT` lists damaged files; run extract again",
+        ) from error
+    planes[UNOBSERVED] = ~planes[1:].any(0)
+    return planes
+
+
+def _sparse(belief: Belief) -> Snapshot:
+    cells, weights = to_sparse(belief.planes)
+    _, rows, columns = belief.planes.shape
+    origin = belief.origin_x_m, belief.origin_y_m
+    return Snapshot(rows, columns, belief.cell_m, *origin, cells.astype(np.int64), weights)
+
+
+def _pose_row(step: Step, estimate: PoseEstimate) -> dict[str, list[Any]]:
+    pose, modes = estimate.map_from_robot, estimate.modes
+    row = {
+        "frame": step.frame,
+        "stamp_nanos": step.stamp_nanos,
+        "x_m": pose.x_m if pose else None,
+        "y_m": pose.y_m if pose else None,
+        "heading_rad": pose.heading_rad if pose else None,
+        "source": estimate.source,
+        "peak": estimate.peak,
+        "entropy_nats": estimate.entropy_nats,
+        "mode_x_m": [mode.map_from_robot.x_m for mode in modes],
+        "mode_y_m": [mode.map_from_robot.y_m for mode in modes],
+        "mode_heading_rad": [mode.map_from_robot.heading_rad for mode in modes],
+        "mode_probability": [mode.probability for mode in modes],
+    }
+    return {name: [value] for name, value in row.items()}
+
+
+def _snapshot_row(step: Step, snapshot: Snapshot) -> dict[str, list[Any]]:
+    row = {
+        "frame": step.frame,
+        "stamp_nanos": step.stamp_nanos,
+        "rows": snapshot.rows,
+        "columns": snapshot.columns,
+        "cell_m": snapshot.cell_m,
+        "origin_x_m": snapshot.origin_x_m,
+        "origin_y_m": snapshot.origin_y_m,
+        "cells": snapshot.cells,
+        "weights": snapshot.weights,
+    }
+    return {name: [value] for name, value in row.items()}

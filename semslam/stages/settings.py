@@ -1,0 +1,168 @@
+"""Configuration of every stage: frozen dataclasses, plain values, stable under JSON, because they feed the cache key.
+
+The text under a field is its documentation: meaning, unit, range, paper symbol. `pipeline/config.py` reads TOML into
+these, checks the ranges declared with `setting` and prints them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+
+def setting(
+    default: Any,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: Sequence[str] | None = None,
+    file: bool = False,
+) -> Any:
+    """A field with what is allowed: a closed range, words to choose from (of every item, for a tuple), or `file`.
+
+    A `file` field holds a path; the cache key takes the content of the file in its place.
+    """
+    metadata = {"low": low, "high": high, "choices": tuple(choices) if choices else None, "file": file}
+    if isinstance(default, dict):
+        return field(default_factory=lambda: dict(default), metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class IngestConfig:
+    """From log to keyframes."""
+
+    topics: Mapping[str, str] = setting({})
+    """Topics by role, for what the guess gets wrong: colour, depth, colour_info, depth_info, imu, odometry, truth."""
+    keyframes: str = setting("time", choices=("time", "motion"))
+    """Take a keyframe every `period_s`, or when the robot has moved (`min_distance_m`, `min_turn_rad`)."""
+    period_s: float = setting(1.0, low=0.0, high=3600.0)
+    """Least time between keyframes, seconds. 0 keeps every pair."""
+    min_distance_m: float = setting(0.3, low=0.0, high=100.0)
+    """With keyframes = "motion": distance that makes a keyframe, metres."""
+    min_turn_rad: float = setting(0.35, low=0.0, high=3.15)
+    """With keyframes = "motion": turn that makes a keyframe, radians."""
+    pair_tolerance_s: float = setting(0.03, low=0.0, high=10.0)
+    """Colour and depth whose stamps differ by more are no pair, seconds."""
+    motion: str = setting("auto", choices=("auto", "odometry", "tf", "imu", "none"))
+    """Where u_t comes from; auto takes odometry, else tf, else the IMU, step by step."""
+    motion_gap_s: float = setting(0.5, low=0.0, high=3600.0)
+    """A source with a longer pause around a keyframe cannot speak for that step, seconds."""
+    levelling: str = setting("auto", choices=("auto", "tf", "imu", "none"))
+    """Where roll and pitch come from; auto takes a gravity-aligned frame of tf, else accelerometer and gyro."""
+    robot_frame: str = setting("")
+    """Frame of the robot's body; empty takes base_footprint or base_link if tf connects it, else the camera's root."""
+    camera_height_m: float = setting(0.0, low=0.0, high=50.0)
+    """Height of the camera above the floor, metres; 0 takes it from tf, else from the floor in the depth images."""
+    depth_unit_m: float = setting(0.0, low=0.0, high=1.0)
+    """Metres of one step of integer depth; 0 takes the convention (1 mm)."""
+    shard_frames: int = setting(200, low=1, high=100000)
+    """Keyframes a shard: what a killed run loses at most."""
+
+
+@dataclass(frozen=True)
+class ExtractConfig:
+    """From keyframes to detections and observation maps (equation 1)."""
+
+    detector: str = setting("", file=True)
+    """ONNX file of the detector."""
+    adapter: str = setting("auto")
+    """Layout of the detector's inputs and outputs; auto recognises it (`semslam models inspect FILE.onnx`)."""
+    classes: str = setting("", file=True)
+    """Text file with the detector's class names, one a line; empty takes them from the model's metadata."""
+    segmenter: str = setting("auto", choices=("auto", "sam", "depth_box", "box"))
+    """How a box becomes a mask; auto is sam if its two files are given, else depth_box (GrabCut seeded by depth)."""
+    segmenter_encoder: str = setting("", file=True)
+    """ONNX file of the segmenter's image encoder."""
+    segmenter_decoder: str = setting("", file=True)
+    """ONNX file of the segmenter's box-prompted mask decoder."""
+    min_score: float = setting(0.3, low=0.0, high=1.0)
+    """Detections below this confidence are dropped."""
+    max_overlap: float = setting(0.5, low=0.0, high=1.0)
+    """Non-maximum suppression: boxes of one class that overlap more (IoU) are one object."""
+    select: tuple[str, ...] = setting(())
+    """Class names to keep, before remapping; empty keeps all."""
+    exclude: tuple[str, ...] = setting(("person",))
+    """Class names to drop, before remapping. People move, so maps leave them out by default."""
+    remap: Mapping[str, str] = setting({})
+    """New names for classes; several may share one."""
+    cell_m: float = setting(0.1, low=0.01, high=10.0)
+    """Cell of the observation map, metres."""
+    side: int = setting(99, low=3, high=2001)
+    """Cells along a side of the observation map, odd; the camera stands at the centre. h, before pooling."""
+    min_depth_m: float = setting(0.3, low=0.0, high=100.0)
+    """Nearer depth is ignored, metres."""
+    max_depth_m: float = setting(6.0, low=0.1, high=1000.0)
+    """Farther depth is ignored, metres."""
+    floor_tolerance_m: float = setting(0.08, low=0.0, high=1.0)
+    """Points within this height of the floor are floor, metres."""
+    max_height_m: float = setting(2.0, low=0.1, high=100.0)
+    """Points higher than this are no obstacle (ceilings, lamps), metres."""
+    min_pixels: int = setting(3, low=1, high=10000)
+    """Floor or obstacle pixels that a cell needs before it counts as seen."""
+    shard_frames: int = setting(100, low=1, high=100000)
+    """Keyframes a shard: what a killed run loses at most."""
+
+
+@dataclass(frozen=True)
+class PaperConfig:
+    """The estimator of the paper, equations 2 to 7 and 10."""
+
+    cell_m: float = setting(0.3, low=0.01, high=10.0)
+    """Cell of the map, metres; an odd multiple of extract.cell_m."""
+    map_side: int = setting(33, low=3, high=2001)
+    """Cells along a side of the map. H = W."""
+    side: int = setting(11, low=3, high=2001)
+    """Cells along a side of the observation. h."""
+    headings: int = setting(360, low=1, high=3600)
+    """Heading bins. R."""
+    noise_floor: float = setting(0.02, low=0.0, high=1.0)
+    """Observation cells below this become 0. beta."""
+    binary: bool = setting(False)
+    """Set observation cells above the noise floor to 1."""
+    temperature: float = setting(1.0, low=1e-6, high=1e6)
+    """Correlation is divided by this before the softmax of equation 2; 1 in the paper."""
+    gate_distance_m: float = setting(0.6, low=0.0, high=1e6)
+    """Largest position difference of visual and inertial pose, metres. gamma_1."""
+    gate_heading_rad: float = setting(0.3, low=0.0, high=3.2)
+    """Largest heading difference, radians. gamma_2."""
+    gate: str = setting("all", choices=("all", "any"))
+    """Accept the visual pose if all, or any, of the two differences are below their gates (equation 4 says all)."""
+    leak: float = setting(0.3, low=0.0, high=1.0)
+    """Weight of a new observation in the heuristic map. alpha of equation 10."""
+
+
+@dataclass(frozen=True)
+class LocalizeConfig:
+    """From observations and motion to poses and maps."""
+
+    estimators: tuple[str, ...] = setting(
+        ("paper", "paper_visual", "dead_reckoning"), choices=("paper", "paper_visual", "dead_reckoning")
+    )
+    """Estimators to run; each gives its own track and map. paper is visual-inertial, paper_visual visual only."""
+    paper: PaperConfig = field(default_factory=PaperConfig)
+    """Section `[localize.paper]`."""
+    snapshot_every: int = setting(10, low=1, high=100000)
+    """Keyframes between two map snapshots; the last keyframe always has one."""
+    modes: int = setting(5, low=1, high=100)
+    """Modes of the pose field kept a frame."""
+    shard_frames: int = setting(200, low=1, high=100000)
+    """Keyframes a shard: what a killed run loses at most."""
+
+    def for_variant(self, estimator: str) -> LocalizeConfig:
+        """The configuration of one estimator alone, so that its cache key ignores the settings of the others."""
+        paper = self.paper if estimator.startswith("paper") else PaperConfig()
+        return replace(self, estimators=(estimator,), paper=paper)
+
+
+@dataclass(frozen=True)
+class ExportConfig:
+    """From tables to files for people and other tools."""
+
+    pixels_per_cell: int = setting(0, low=0, high=200)
+    """Pixels of the map picture a cell; 0 chooses a picture of about 1000 pixels."""
+    occupied_threshold: float = setting(0.65, low=0.0, high=1.0)
+    """occupied_thresh of the map_server file."""
+    free_threshold: float = setting(0.25, low=0.0, high=1.0)
+    """free_thresh of the map_server file."""

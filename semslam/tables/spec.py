@@ -1,0 +1,301 @@
+"""Every table of data_spec.md as plain data; a test keeps the two equal.
+
+Pure Python on purpose: planning a run needs the tables' names, and must not pay for importing pyarrow.
+Conventions (time, frames, grid, missing values) stand in data_spec.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+SPEC_VERSION = 1
+"""Version of the tables; stored in every file and refused when another one is read."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column: `type` is a word of `TYPES`, `unit` is empty for pure numbers, `null` says if it may miss."""
+
+    name: str
+    type: str
+    unit: str
+    null: bool
+    meaning: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table: a file `NAME.parquet` (or one per shard) written by exactly one stage."""
+
+    name: str
+    number: int
+    stage: str
+    columns: tuple[Column, ...]
+
+    def column(self, name: str) -> Column:
+        """The column of that name; KeyError if there is none."""
+        for column in self.columns:
+            if column.name == name:
+                return column
+        raise KeyError(name)
+
+
+TYPES = (
+    "bool",
+    "int8",
+    "int32",
+    "int64",
+    "uint16",
+    "uint32",
+    "uint64",
+    "float32",
+    "float64",
+    "string",
+    "binary",
+    "list<int64>",
+    "list<uint32>",
+    "list<float32>",
+    "list<float64>",
+)
+
+
+def _c(name: str, kind: str, unit: str, meaning: str, *, null: bool = False) -> Column:
+    return Column(name, kind, unit, null, meaning)
+
+
+_FRAME = _c("frame", "int32", "", "keyframe index within the log, from 0")
+_STAMP = _c("stamp_nanos", "int64", "ns", "header stamp of the colour image, Unix time")
+
+TOPICS = Table(
+    "topics",
+    1,
+    "ingest",
+    (
+        _c("topic", "string", "", "topic name"),
+        _c("schema_name", "string", "", "message type as the log names it; empty if the channel has no schema"),
+        _c("message_encoding", "string", "", "cdr, ros1, protobuf, json, ..."),
+        _c("role", "string", "", "what ingest used it for: colour, depth, colour_info, ...; null if unused", null=True),
+        _c("messages", "uint64", "", "messages read"),
+        _c("skipped", "uint64", "", "messages that could not be decoded or used"),
+        _c("reason", "string", "", "why messages were skipped or the topic refused; null if nothing was", null=True),
+        _c("first_log_time_nanos", "int64", "ns", "log time of the first message; null without messages", null=True),
+        _c("last_log_time_nanos", "int64", "ns", "log time of the last message; null without messages", null=True),
+        _c("max_gap_s", "float64", "s", "longest pause between two messages; null below two messages", null=True),
+        _c("clock_jumps", "uint32", "", "times the header stamp jumped against log time"),
+    ),
+)
+
+FRAMES = Table(
+    "frames",
+    2,
+    "ingest",
+    (
+        _FRAME,
+        _STAMP,
+        _c("log_time_nanos", "int64", "ns", "log time of the colour message"),
+        _c("colour", "binary", "", "JPEG or PNG file, 3 channels, rectified (pinhole)"),
+        _c(
+            "depth",
+            "binary",
+            "",
+            "16-bit PNG file, millimetres along the optical axis, registered to colour; 0 = missing",
+        ),
+        _c("depth_offset_nanos", "int64", "ns", "stamp of the depth image minus stamp of the colour image"),
+        _c("width", "int32", "px", "columns of colour and depth"),
+        _c("height", "int32", "px", "rows of colour and depth"),
+        _c("fx", "float64", "px", "focal length along columns"),
+        _c("fy", "float64", "px", "focal length along rows"),
+        _c("cx", "float64", "px", "principal point, column; the centre of the first pixel is 0"),
+        _c("cy", "float64", "px", "principal point, row"),
+        _c(
+            "robot_from_camera",
+            "list<float64>",
+            "m",
+            "4x4 matrix, row by row: optical camera frame to levelled robot frame",
+        ),
+        _c("roll_rad", "float64", "rad", "tilt that levelling removed about the robot's x axis"),
+        _c("pitch_rad", "float64", "rad", "tilt that levelling removed about the robot's y axis, nose down positive"),
+        _c("level_source", "string", "", "tf, imu or none"),
+        _c("camera_height_m", "float64", "m", "height of the camera above the floor (also in robot_from_camera)"),
+        _c(
+            "height_source",
+            "string",
+            "",
+            "tf, config, floor (plane seen in this frame), held (from earlier frames) or none",
+        ),
+    ),
+)
+
+MOTION = Table(
+    "motion",
+    3,
+    "ingest",
+    (
+        _FRAME,
+        _STAMP,
+        _c(
+            "dx_m",
+            "float64",
+            "m",
+            "forward motion since the previous keyframe, in its robot frame; null if unknown",
+            null=True,
+        ),
+        _c("dy_m", "float64", "m", "leftward motion, likewise", null=True),
+        _c("dheading_rad", "float64", "rad", "left turn, likewise, in (-pi, pi]", null=True),
+        _c("source", "string", "", "start (first keyframe), odometry, tf, imu or none"),
+    ),
+)
+
+TRUTH = Table(
+    "truth",
+    4,
+    "ingest",
+    (
+        _FRAME,
+        _STAMP,
+        _c("x_m", "float64", "m", "true position of the robot frame in the truth's own world frame"),
+        _c("y_m", "float64", "m", "likewise"),
+        _c("z_m", "float64", "m", "likewise"),
+        _c("heading_rad", "float64", "rad", "true direction of the robot's x axis on the ground plane"),
+        _c("roll_rad", "float64", "rad", "true tilt of the truth's body about its x axis"),
+        _c("pitch_rad", "float64", "rad", "true tilt about its y axis, nose down positive"),
+    ),
+)
+
+DETECTIONS = Table(
+    "detections",
+    5,
+    "extract",
+    (
+        _FRAME,
+        _STAMP,
+        _c("detection", "int32", "", "index within the frame, from 0, by falling score"),
+        _c("class_id", "uint16", "", "index into the class list"),
+        _c("label", "string", "", "class name after remapping"),
+        _c("source_label", "string", "", "class name as the detector gave it"),
+        _c("score", "float32", "", "confidence, 0 to 1"),
+        _c("x0_px", "float32", "px", "left edge of the box"),
+        _c("y0_px", "float32", "px", "top edge of the box"),
+        _c("x1_px", "float32", "px", "right edge of the box, exclusive"),
+        _c("y1_px", "float32", "px", "bottom edge of the box, exclusive"),
+        _c("mask_runs", "list<uint32>", "px", "run lengths of the mask row by row, background first"),
+        _c("mask_pixels", "uint32", "px", "pixels in the mask"),
+        _c("depth_pixels", "uint32", "px", "pixels in the mask with usable depth"),
+        _c("min_x_m", "float64", "m", "3D extent in the robot frame, 2nd percentile; null without depth", null=True),
+        _c("min_y_m", "float64", "m", "likewise", null=True),
+        _c("min_z_m", "float64", "m", "likewise; 0 is the floor", null=True),
+        _c("max_x_m", "float64", "m", "98th percentile", null=True),
+        _c("max_y_m", "float64", "m", "likewise", null=True),
+        _c("max_z_m", "float64", "m", "likewise", null=True),
+    ),
+)
+
+OBSERVATIONS = Table(
+    "observations",
+    6,
+    "extract",
+    (
+        _FRAME,
+        _STAMP,
+        _c("cells", "list<uint32>", "", "(class_id * side + iy) * side + ix of each non-zero entry, rising"),
+        _c("weights", "list<float32>", "", "value of each entry, 0 to 1 (equation 1); parallel to cells"),
+        _c("objects", "int32", "", "detections that reached the observation"),
+    ),
+)
+
+POSES = Table(
+    "poses",
+    7,
+    "localize",
+    (
+        _FRAME,
+        _STAMP,
+        _c(
+            "x_m", "float64", "m", "position of the robot in the map frame; null if the estimator gives none", null=True
+        ),
+        _c("y_m", "float64", "m", "likewise", null=True),
+        _c("heading_rad", "float64", "rad", "direction of the robot's x axis in the map frame, (-pi, pi]", null=True),
+        _c("source", "string", "", "start, visual, inertial or none"),
+        _c("peak", "float64", "", "probability of the best pose bin; null without a pose field", null=True),
+        _c("entropy_nats", "float64", "nat", "entropy of the pose field; null without one", null=True),
+        _c("mode_x_m", "list<float64>", "m", "top modes of the pose field, best first; empty without one"),
+        _c("mode_y_m", "list<float64>", "m", "likewise"),
+        _c("mode_heading_rad", "list<float64>", "rad", "likewise"),
+        _c("mode_probability", "list<float64>", "", "probability of each mode's bin"),
+    ),
+)
+
+SNAPSHOTS = Table(
+    "snapshots",
+    8,
+    "localize",
+    (
+        _FRAME,
+        _STAMP,
+        _c("rows", "int32", "", "cells along y"),
+        _c("columns", "int32", "", "cells along x"),
+        _c("cell_m", "float64", "m", "side of a cell"),
+        _c("origin_x_m", "float64", "m", "map frame x of the lower corner of cell ix = 0"),
+        _c("origin_y_m", "float64", "m", "map frame y of the lower corner of cell iy = 0"),
+        _c("cells", "list<uint32>", "", "(class_id * rows + iy) * columns + ix of each non-zero entry, rising"),
+        _c("weights", "list<float32>", "", "probability of each entry; parallel to cells"),
+    ),
+)
+
+CELLS = Table(
+    "cells",
+    9,
+    "localize",
+    (
+        _c("ix", "int32", "", "cell column; the cell covers [ix, ix + 1) * cell_m along x of the map frame"),
+        _c("iy", "int32", "", "cell row, likewise along y"),
+        _c("x_m", "float64", "m", "cell centre in the map frame"),
+        _c("y_m", "float64", "m", "cell centre in the map frame"),
+        _c("class_id", "uint16", "", "most probable class, an index into the class list"),
+        _c("label", "string", "", "its name"),
+        _c("probability", "float32", "", "probability of that class"),
+        _c("hits", "uint32", "", "keyframes that saw this class in the cell"),
+        _c("views", "uint32", "", "keyframes that saw the cell at all"),
+        _c("first_seen_nanos", "int64", "ns", "stamp of the first keyframe that saw the cell"),
+        _c("last_seen_nanos", "int64", "ns", "stamp of the last keyframe that saw the cell"),
+    ),
+)
+
+TRAJECTORY = Table(
+    "trajectory",
+    10,
+    "export",
+    (
+        _FRAME,
+        _STAMP,
+        _c("x_m", "float64", "m", "position of the robot in the map frame"),
+        _c("y_m", "float64", "m", "likewise"),
+        _c("heading_rad", "float64", "rad", "direction of the robot's x axis in the map frame, (-pi, pi]"),
+    ),
+)
+
+EVALUATION = Table(
+    "evaluation",
+    11,
+    "evaluate",
+    (
+        _c("log", "string", "", "log name"),
+        _c("estimator", "string", "", "estimator name, or `chance` or `standstill`"),
+        _c("frames", "int32", "", "keyframes with truth"),
+        _c("coverage", "float64", "", "share of those keyframes with a pose, 0 to 1"),
+        _c(
+            "ape_m",
+            "float64",
+            "m",
+            "mean position error without alignment beyond the first pose; null without poses",
+            null=True,
+        ),
+        _c("de_deg", "float64", "deg", "mean absolute heading error; null without poses", null=True),
+        _c("ape_worst_m", "float64", "m", "largest position error", null=True),
+        _c("de_worst_deg", "float64", "deg", "largest heading error", null=True),
+    ),
+)
+
+ALL_TABLES: tuple[Table, ...] = (
+    TOPICS, FRAMES, MOTION, TRUTH, DETECTIONS, OBSERVATIONS, POSES, SNAPSHOTS, CELLS, TRAJECTORY, EVALUATION,
+)  # fmt: skip

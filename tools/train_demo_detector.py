@@ -1,0 +1,509 @@
+"""Trains the detector of `semslam demo` on random toy rooms and writes the ONNX file and its card.
+
+    pip install -e ".[train]"
+    python tools/train_demo_detector.py
+
+Data: pictures of rooms that the demo never uses, with the boxes of their visible pixels as truth. Network: a small
+anchor-free convolutional detector with two output levels (strides 8 and 16), trained with task-aligned assignment
+(Feng et al. 2021, TOOD) as YOLOv8 does. Output layout is that of YOLOv8: (1, 4 + classes, cells), boxes as centre x,
+centre y, width, height in input pixels, then class probabilities. One CPU, no GPU; the same seed and the same number
+of threads give the same file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import pickle
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+import torch.nn.functional as F  # noqa: N812 - the name everybody uses
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from semslam.sim.render import Renderer, View, pinhole, visible_boxes
+from semslam.sim.robot import base_pose, mount, optical, plan_path
+from semslam.sim.toyroom import CLASSES, make_room
+
+WIDTH, HEIGHT = 320, 240
+STRIDES = (8, 16)
+TRAIN_ROOMS = range(10_000, 10_400)
+TEST_ROOMS = range(20_000, 20_030)
+VIEWS_A_ROOM = 8
+MIN_PIXELS, MIN_SIDE_PX = 120, 8
+"""An object counts from this many visible pixels and this side on; smaller ones are neither wanted nor punished."""
+FLAT_PIXELS = 20
+DATA = Path(__file__).resolve().parent.parent / "semslam" / "data"
+
+
+@dataclass(frozen=True)
+class Example:
+    """One picture as JPEG, its boxes (N, 4) left, top, right, bottom, class ids (N,), and boxes to ignore (M, 4)."""
+
+    jpeg: bytes
+    boxes: NDArray[np.float32]
+    classes: NDArray[np.int64]
+    ignored: NDArray[np.float32]
+
+
+def main() -> None:
+    args = _arguments()
+    torch.manual_seed(args.seed)
+    torch.set_num_threads(args.threads)
+    torch.use_deterministic_algorithms(True)
+    train, test = _examples(args.cache, "train", TRAIN_ROOMS), _examples(args.cache, "test", TEST_ROOMS)
+    print(f"{len(train)} pictures to train on, {len(test)} to test on", flush=True)
+    network = fit(train, steps=args.steps, batch=args.batch, seed=args.seed)
+    target = Path(args.out)
+    export(network, target)
+    report = evaluate(target, test)
+    small = evaluate(target, test, shrink=2)
+    print(report, small, sep="\n")
+    target.with_suffix(".md").write_text(card(target, args, (len(train), len(test)), report, small), encoding="utf-8")
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--steps", type=int, default=2500)
+    parser.add_argument("--batch", type=int, default=16)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--cache", default="", help="folder to keep the rendered pictures in")
+    parser.add_argument("--out", default=str(DATA / "demo_detector.onnx"))
+    return parser.parse_args()
+
+
+# Data
+
+
+def _examples(cache: str, name: str, rooms: Sequence[int]) -> list[Example]:
+    stored = Path(cache) / f"{name}.pickle"
+    if cache and stored.exists():
+        rows: list[Example] = pickle.loads(stored.read_bytes())
+        return rows
+    examples = [example for seed in rooms for example in _room_examples(seed)]
+    if cache:
+        stored.parent.mkdir(parents=True, exist_ok=True)
+        stored.write_bytes(pickle.dumps(examples))
+    return examples
+
+
+def _room_examples(seed: int) -> Iterator[Example]:
+    """Views of one room from along its path, by cameras of different height, pitch and field of view."""
+    rng = np.random.default_rng([seed, 0xDE7])
+    room = make_room(seed)
+    renderer, path = Renderer(room), plan_path(room, seed)
+    for time_s in rng.uniform(0, 60, VIEWS_A_ROOM):
+        camera = pinhole(WIDTH, HEIGHT, float(np.deg2rad(rng.uniform(70, 95))))
+        pitch = float(np.deg2rad(rng.uniform(2, 28)))
+        link = mount(0.1, float(rng.uniform(-0.1, 0.1)), float(rng.uniform(0.45, 0.75)), pitch_rad=pitch)
+        wander = np.eye(4)
+        wander[:2, :2] = _turn(float(rng.normal(0, 0.5)))
+        yield _example(renderer.view(camera, base_pose(path, float(time_s)) @ wander @ link @ optical()))
+
+
+def _turn(angle: float) -> NDArray[np.float64]:
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def _example(view: View) -> Example:
+    seen = visible_boxes(view, min_pixels=FLAT_PIXELS)
+    boxes = np.array([(b.left, b.top, b.right, b.bottom) for b in seen], np.float32).reshape(-1, 4)
+    classes = np.array([b.class_id for b in seen], np.int64)
+    sides = np.minimum(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1])
+    counts = (np.array([b.pixels for b in seen]) >= MIN_PIXELS) & (sides >= MIN_SIDE_PX)
+    done, jpeg = cv2.imencode(".jpg", view.rgb[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+    if not done:
+        raise RuntimeError("OpenCV could not encode a picture")
+    return Example(jpeg.tobytes(), boxes[counts], classes[counts], boxes[~counts])
+
+
+def _picture(example: Example) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB."""
+    decoded = cv2.imdecode(np.frombuffer(example.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    return np.asarray(decoded[:, :, ::-1], np.uint8)
+
+
+def _augment(example: Example, rng: np.random.Generator) -> tuple[NDArray[np.float32], Example]:
+    """Picture (3, H, W) in 0..1 with other light, colour, sharpness, noise and side; the example with its boxes."""
+    picture = cv2.LUT(_picture(example), _exposure(rng))
+    if rng.random() < 0.4:
+        share = float(rng.uniform(0.4, 0.9))
+        small = cv2.resize(picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
+        picture = cv2.resize(small, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
+    mixed = cv2.transform(picture.astype(np.float32) / 255, _saturation(float(rng.uniform(0.5, 1.4))))
+    mixed += rng.standard_normal(mixed.shape, np.float32) * np.float32(rng.uniform(0, 0.04))
+    if rng.random() < 0.5:
+        mixed = mixed[:, ::-1]
+        example = replace(example, boxes=_flip(example.boxes), ignored=_flip(example.ignored))
+    return np.clip(mixed, 0, 1).transpose(2, 0, 1).copy(), example
+
+
+def _exposure(rng: np.random.Generator) -> NDArray[np.uint8]:
+    """(256, 1, 3) look-up table: gamma, gain, and a cast of colour."""
+    ramp = np.arange(256)[:, None] / 255
+    curve = ramp ** rng.uniform(0.7, 1.4) * rng.uniform(0.6, 1.3) * rng.uniform(0.8, 1.2, 3)
+    return np.asarray((np.clip(curve, 0, 1) * 255).astype(np.uint8)[:, None])
+
+
+def _saturation(factor: float) -> NDArray[np.float32]:
+    """(3, 3) matrix that moves colours away from grey (above 1) or towards it."""
+    return np.asarray(factor * np.eye(3) + (1 - factor) / 3, np.float32)
+
+
+def _flip(boxes: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.stack([WIDTH - boxes[:, 2], boxes[:, 1], WIDTH - boxes[:, 0], boxes[:, 3]], axis=1)
+
+
+def _batches(examples: list[Example], steps: int, batch: int, seed: int) -> Iterator[tuple[Tensor, list[Example]]]:
+    rng = np.random.default_rng([seed, 0xBA7])
+    order: list[int] = []
+    for _ in range(steps):
+        while len(order) < batch:
+            order += rng.permutation(len(examples)).tolist()
+        chosen, order = order[:batch], order[batch:]
+        pairs = [_augment(examples[index], rng) for index in chosen]
+        pictures = torch.from_numpy(np.stack([picture for picture, _ in pairs]))
+        yield pictures.to(memory_format=torch.channels_last), [example for _, example in pairs]
+
+
+# Network
+
+
+def _conv(inputs: int, outputs: int, size: int = 3, stride: int = 1, groups: int = 1) -> nn.Sequential:
+    convolution = nn.Conv2d(inputs, outputs, size, stride, size // 2, groups=groups, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.SiLU())
+
+
+def _light(inputs: int, outputs: int, size: int = 3, stride: int = 1) -> nn.Sequential:
+    """Depthwise, then pointwise."""
+    return nn.Sequential(_conv(inputs, inputs, size, stride, groups=inputs), _conv(inputs, outputs, 1))
+
+
+class Residual(nn.Module):
+    def __init__(self, body: nn.Module) -> None:
+        super().__init__()
+        self.body = body
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.body(x)
+
+
+def _bottleneck(channels: int) -> Residual:
+    return Residual(nn.Sequential(_conv(channels, channels // 2, 1), _conv(channels // 2, channels)))
+
+
+class Head(nn.Module):
+    """Class logits and box distances of one level."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.classes = nn.Sequential(_light(channels, channels), nn.Conv2d(channels, len(CLASSES), 1))
+        self.boxes = nn.Sequential(_light(channels, channels), nn.Conv2d(channels, 4, 1))
+        nn.init.constant_(self.classes[-1].bias, -4.0)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, h, w) -> (B, 4 + classes, h * w)"""
+        return torch.cat([self.boxes(x), self.classes(x)], 1).flatten(2)
+
+
+class Detector(nn.Module):
+    """(B, 3, 240, 320) RGB in 0..1 -> raw (B, 4 + classes, cells): log distances to the sides, class logits."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.to4 = nn.Sequential(_conv(3, 12, stride=2), _conv(12, 24, stride=2), Residual(_conv(24, 24)))
+        self.to8 = nn.Sequential(_conv(24, 40, stride=2), _bottleneck(40))
+        self.to16 = nn.Sequential(_conv(40, 64, stride=2), _bottleneck(64))
+        self.to32 = nn.Sequential(_light(64, 72, stride=2), Residual(_light(72, 72, 5)), Residual(_light(72, 72, 5)))
+        self.from32, self.from16 = _conv(72, 64, 1), _conv(64, 40, 1)
+        self.join16, self.join8 = Residual(_light(64, 64)), Residual(_light(40, 40))
+        self.head8, self.head16 = Head(40), Head(64)
+
+    def forward(self, x: Tensor) -> Tensor:
+        p8 = self.to8(self.to4(x))
+        p16 = self.to16(p8)
+        p32 = self.to32(p16)
+        p16 = self.join16(p16 + _double(self.from32(p32))[:, :, : p16.shape[2]])
+        p8 = self.join8(p8 + _double(self.from16(p16)))
+        return torch.cat([self.head8(p8), self.head16(p16)], 2)
+
+
+def _double(x: Tensor) -> Tensor:
+    return F.interpolate(x, scale_factor=2.0, mode="nearest")
+
+
+def cell_centres() -> tuple[Tensor, Tensor]:
+    """(cells, 2) centres in pixels and (cells,) strides, in the order of the network's output."""
+    centres, strides = [], []
+    for stride in STRIDES:
+        rows, columns = HEIGHT // stride, WIDTH // stride
+        y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+        centres.append((torch.stack([x, y], -1).reshape(-1, 2) + 0.5) * stride)
+        strides.append(torch.full((rows * columns,), float(stride)))
+    return torch.cat(centres), torch.cat(strides)
+
+
+def to_boxes(raw: Tensor, centres: Tensor, strides: Tensor) -> Tensor:
+    """(B, 4, cells) log distances -> (B, cells, 4) left, top, right, bottom in pixels."""
+    distances = raw.clamp(-4, 4).exp().transpose(1, 2) * strides[:, None]
+    return torch.cat([centres - distances[..., :2], centres + distances[..., 2:]], -1)
+
+
+class Decoded(nn.Module):
+    """The network with decoded output, as it is exported."""
+
+    def __init__(self, network: Detector) -> None:
+        super().__init__()
+        self.network = network
+        centres, strides = cell_centres()
+        self.register_buffer("centres", centres)
+        self.register_buffer("strides", strides)
+
+    def forward(self, images: Tensor) -> Tensor:
+        raw = self.network(images)
+        boxes = to_boxes(raw[:, :4], self.centres, self.strides)
+        middle, size = (boxes[..., :2] + boxes[..., 2:]) / 2, boxes[..., 2:] - boxes[..., :2]
+        return torch.cat([torch.cat([middle, size], -1).transpose(1, 2), raw[:, 4:].sigmoid()], 1)
+
+
+# Training
+
+
+def fit(examples: list[Example], *, steps: int, batch: int, seed: int) -> Detector:
+    """Train and return the moving average of the weights."""
+    network = Detector().to(memory_format=torch.channels_last)  # twice as fast on a CPU
+    print(f"{sum(p.numel() for p in network.parameters())} parameters", flush=True)
+    average = torch.optim.swa_utils.AveragedModel(
+        network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.998), use_buffers=True
+    )
+    optimizer = torch.optim.AdamW(network.parameters(), lr=3e-3, weight_decay=1e-3)
+    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total_steps=steps, pct_start=0.1)
+    total = 0.0
+    for step, (pictures, truth) in enumerate(_batches(examples, steps, batch, seed), 1):
+        loss = detection_loss(network(pictures), truth)
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), 10.0)
+        optimizer.step()
+        rate.step()
+        average.update_parameters(network)
+        total += loss.item()
+        if step % 100 == 0:
+            print(f"step {step} of {steps}  loss {total / 100:.3f}", flush=True)
+            total = 0.0
+    trained: Detector = average.module
+    return trained.to(memory_format=torch.contiguous_format).eval()
+
+
+def detection_loss(raw: Tensor, truth: list[Example]) -> Tensor:
+    """Classification against soft targets, and 1 - GIoU of the assigned cells weighted by them."""
+    centres, strides = cell_centres()
+    boxes, logits = to_boxes(raw[:, :4], centres, strides), raw[:, 4:].transpose(1, 2)
+    targets = [assign(boxes[i].detach(), logits[i].detach().sigmoid(), centres, truth[i]) for i in range(len(truth))]
+    wanted = torch.stack([target[0] for target in targets])
+    goal = torch.stack([target[1] for target in targets])
+    used = torch.stack([target[2] for target in targets])
+    weight = wanted.sum(-1)
+    total = weight.sum().clamp(min=1)
+    classification = (F.binary_cross_entropy_with_logits(logits, wanted, reduction="none") * used[..., None]).sum()
+    chosen = weight > 0
+    regression = ((1 - generalised_iou(boxes[chosen], goal[chosen])) * weight[chosen]).sum()
+    return (classification + 4.0 * regression) / total
+
+
+def assign(boxes: Tensor, scores: Tensor, centres: Tensor, truth: Example) -> tuple[Tensor, Tensor, Tensor]:
+    """Which cell answers for which object: soft class targets (cells, classes), boxes (cells, 4), cells that count.
+
+    Each object takes the ten cells inside it whose answer is best, score^0.5 * IoU^4; a cell wanted by several goes
+    to the one it overlaps most. Cells on objects too small to count are left out of the loss.
+    """
+    wanted, goal, used = torch.zeros_like(scores), torch.zeros_like(boxes), torch.ones(len(boxes))
+    if len(truth.ignored):
+        used[_inside(centres, torch.from_numpy(truth.ignored)).any(0)] = 0
+    if not len(truth.boxes):
+        return wanted, goal, used
+    objects, classes = torch.from_numpy(truth.boxes), torch.from_numpy(truth.classes)
+    overlap = pairwise_iou(objects, boxes).clamp(min=1e-6)  # (G, cells)
+    quality = scores[:, classes].T.clamp(min=1e-6).sqrt() * overlap**4
+    quality = quality * _inside(centres, objects)
+    best = quality.topk(10, dim=1)
+    mine = torch.zeros_like(quality).scatter_(1, best.indices, 1.0) * (quality > 0)
+    owner = (mine * overlap).argmax(0)
+    taken = mine.amax(0) > 0
+    mine = mine * F.one_hot(owner, len(objects)).T
+    quality = quality * mine
+    strength = quality / quality.amax(1, keepdim=True).clamp(min=1e-9) * (overlap * mine).amax(1, keepdim=True)
+    cells = torch.nonzero(taken).squeeze(1)
+    wanted[cells, classes[owner[cells]]] = strength.amax(0)[cells].clamp(min=0.05)
+    goal[cells] = objects[owner[cells]]
+    used[cells] = 1
+    return wanted, goal, used
+
+
+def _inside(centres: Tensor, boxes: Tensor) -> Tensor:
+    """(G, cells) True where the centre lies in the box."""
+    low, high = centres[None] - boxes[:, None, :2], boxes[:, None, 2:] - centres[None]
+    return torch.cat([low, high], -1).amin(-1) > 0
+
+
+def pairwise_iou(first: Tensor, second: Tensor) -> Tensor:
+    """(G, 4), (N, 4) -> (G, N)"""
+    low = torch.maximum(first[:, None, :2], second[None, :, :2])
+    high = torch.minimum(first[:, None, 2:], second[None, :, 2:])
+    shared = (high - low).clamp(min=0).prod(-1)
+    areas = [(b[:, 2:] - b[:, :2]).prod(-1) for b in (first, second)]
+    return shared / (areas[0][:, None] + areas[1][None] - shared)
+
+
+def generalised_iou(first: Tensor, second: Tensor) -> Tensor:
+    """(N, 4), (N, 4) -> (N,); Rezatofighi et al. 2019."""
+    low, high = torch.maximum(first[:, :2], second[:, :2]), torch.minimum(first[:, 2:], second[:, 2:])
+    shared = (high - low).clamp(min=0).prod(-1)
+    union = sum((b[:, 2:] - b[:, :2]).prod(-1) for b in (first, second)) - shared
+    hull = (torch.maximum(first[:, 2:], second[:, 2:]) - torch.minimum(first[:, :2], second[:, :2])).prod(-1)
+    return shared / union - (hull - union) / hull
+
+
+# Export and evaluation
+
+
+def export(network: Detector, target: Path) -> None:
+    """Write one self-contained ONNX file with the class names in its metadata."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    torch.onnx.export(
+        Decoded(network).eval(),
+        (torch.zeros(1, 3, HEIGHT, WIDTH),),
+        str(target),
+        input_names=["images"],
+        output_names=["output0"],
+        dynamo=True,
+        external_data=False,
+    )
+    model = onnx.load(target)
+    strip_traces(model)
+    names = dict(enumerate(CLASSES))
+    onnx.helper.set_model_props(model, {"names": repr(names), "task": "detect", "license": "Apache-2.0"})
+    onnx.checker.check_model(model)
+    target.write_bytes(model.SerializeToString(deterministic=True))
+
+
+def strip_traces(model: onnx.ModelProto) -> None:
+    """Drop what the exporter notes about source lines: it makes the file larger and differ between machines."""
+    del model.graph.metadata_props[:]
+    for node in model.graph.node:
+        del node.metadata_props[:]
+        node.doc_string = ""
+    for value in [*model.graph.input, *model.graph.output, *model.graph.value_info]:
+        del value.metadata_props[:]
+    del model.graph.value_info[:]
+
+
+def evaluate(model: Path, examples: list[Example], *, min_score: float = 0.3, shrink: int = 1) -> dict[str, float]:
+    """Precision and recall at IoU 0.5 of the exported file, all and by class; `shrink` tests smaller cameras."""
+    session = onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
+    counts = np.zeros((3, len(CLASSES)))  # hits, false alarms, misses
+    for example in examples:
+        picture = _picture(example)
+        if shrink > 1:
+            small = cv2.resize(picture, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
+            picture = cv2.resize(small, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
+        images = picture.astype(np.float32).transpose(2, 0, 1)[None] / 255
+        found, labels = suppress(session.run(None, {"images": images})[0][0], min_score)
+        counts += tally(found, labels, example)
+    hits, alarms, misses = counts
+    result = {
+        "precision": float(hits.sum() / max(1, hits.sum() + alarms.sum())),
+        "recall": float(hits.sum() / max(1, hits.sum() + misses.sum())),
+    }
+    for index, name in enumerate(CLASSES):
+        result[f"precision {name}"] = float(hits[index] / max(1, hits[index] + alarms[index]))
+        result[f"recall {name}"] = float(hits[index] / max(1, hits[index] + misses[index]))
+    return result
+
+
+def suppress(output: NDArray[np.float32], min_score: float) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Boxes (N, 4) and classes (N,) above `min_score` after non-maximum suppression, best first."""
+    middle, size, scores = output[:2].T, output[2:4].T, output[4:].T
+    boxes, labels, best = np.hstack([middle - size / 2, middle + size / 2]), scores.argmax(1), scores.max(1)
+    order = [index for index in np.argsort(-best, kind="stable") if best[index] >= min_score]
+    kept: list[int] = []
+    for index in order:
+        rivals = [other for other in kept if labels[other] == labels[index]]
+        if not rivals or box_iou(boxes[[index]], boxes[rivals]).max() <= 0.5:
+            kept.append(int(index))
+    return boxes[kept], labels[kept]
+
+
+def tally(found: NDArray[np.float32], labels: NDArray[np.int64], example: Example) -> NDArray[np.float64]:
+    """(3, classes) hits, false alarms and misses; answers on ignored objects count as neither."""
+    counts = np.zeros((3, len(CLASSES)))
+    open_truth = list(range(len(example.boxes)))
+    for box, label in zip(found, labels, strict=True):
+        overlaps = [
+            float(box_iou(box[None], example.boxes[[index]])[0, 0]) if example.classes[index] == label else 0.0
+            for index in open_truth
+        ]
+        if overlaps and max(overlaps) >= 0.5:
+            counts[0, label] += 1
+            open_truth.pop(int(np.argmax(overlaps)))
+        elif not len(example.ignored) or box_iou(box[None], example.ignored).max() < 0.5:
+            counts[1, label] += 1
+    for index in open_truth:
+        counts[2, example.classes[index]] += 1
+    return counts
+
+
+def box_iou(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, 4), (M, 4) -> (N, M)"""
+    return np.asarray(pairwise_iou(torch.from_numpy(first), torch.from_numpy(second)).numpy(), np.float32)
+
+
+def card(
+    model: Path, args: argparse.Namespace, pictures: tuple[int, int], report: dict[str, float], small: dict[str, float]
+) -> str:
+    """The model card, from the run itself."""
+    content = model.read_bytes()
+    rows = "\n".join(
+        f"| {name} | {report[f'precision {name}']:.3f} | {report[f'recall {name}']:.3f} |" for name in CLASSES
+    )
+    return f"""# demo_detector.onnx
+
+The detector of `semslam demo`: finds {", ".join(CLASSES)} in pictures of the simulated rooms of `semslam.sim`. It is
+a toy, trained on simulated rooms only, and is of no use on photographs.
+
+| | |
+|---|---|
+| file | {len(content) // 1000} kB, SHA-256 `{hashlib.sha256(content).hexdigest()}` |
+| input | `images` (1, 3, {HEIGHT}, {WIDTH}), RGB, 0 to 1 |
+| output | `output0` (1, {4 + len(CLASSES)}, {len(cell_centres()[1])}), YOLOv8 layout, boxes in input pixels |
+| classes | metadata key `names` |
+| network | anchor-free, strides 8 and 16, {sum(p.numel() for p in Detector().parameters())} parameters |
+| data | {pictures[0]} pictures of rooms {TRAIN_ROOMS.start} to {TRAIN_ROOMS.stop - 1}, rendered by `semslam.sim` |
+| command | `python tools/train_demo_detector.py --seed {args.seed} --steps {args.steps} --batch {args.batch} \
+--threads {args.threads}` |
+| torch | {torch.__version__} |
+| date | 2026-11-22 |
+| licence | Apache-2.0, model and data |
+
+Measured on {pictures[1]} pictures of rooms {TEST_ROOMS.start} to {TEST_ROOMS.stop - 1}, which were not trained on:
+IoU 0.5, score 0.3 and above, objects of {MIN_PIXELS} visible pixels or more.
+
+| class | precision | recall |
+|---|---|---|
+| **all** | **{report["precision"]:.3f}** | **{report["recall"]:.3f}** |
+{rows}
+
+From pictures of half the size, enlarged: precision {small["precision"]:.3f}, recall {small["recall"]:.3f}.
+"""
+
+
+if __name__ == "__main__":
+    main()
