@@ -22,35 +22,36 @@ from semslam.tables.parquet import TableFiles, TableFileWriter, write_table
 from semslam.tables.spec import MOTION, OBSERVATIONS, Table
 
 CELL_M, SIDE = 0.1, 99
-CLASSES = class_list(("chair", "table", "plant", "couch"))
+CLASSES = class_list(("chair", "table", "plant", "couch", "tv", "sink", "bed", "lamp"))
 SECOND = 1_000_000_000
 NO_BIAS = SE2(0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class World:
-    """Points with classes in the map frame: (N, 2) metres, (N,) class ids."""
+    """Objects of half a metre: middles (N, 2) in the map frame, metres, and class ids (N,)."""
 
-    points: NDArray[np.float64]
+    middles: NDArray[np.float64]
     class_id: NDArray[np.int64]
 
     def observe(self, map_from_robot: SE2, range_m: float = 4.5, half_angle_rad: float = 1.0) -> Planes:
-        """The perfect observation: floor in the field of view, weight 1 in the cell of every visible object."""
+        """The perfect observation: floor in the field of view, and the visible part of every object by equation 1."""
         planes = np.zeros((len(CLASSES), SIDE, SIDE), np.float32)
         y, x = (np.mgrid[:SIDE, :SIDE] - SIDE // 2) * CELL_M
-        planes[FREE_FLOOR] = (np.hypot(x, y) < range_m) & (np.abs(np.arctan2(y, x)) < half_angle_rad)
-        seen = map_from_robot.inverse().apply(self.points)
-        column, row = (np.floor(seen / CELL_M + SIDE / 2).astype(int)).T
-        inside = (row >= 0) & (row < SIDE) & (column >= 0) & (column < SIDE)
-        for r, c, class_id in zip(row[inside], column[inside], self.class_id[inside], strict=True):
-            if planes[FREE_FLOOR, r, c]:
-                planes[:, r, c] = 0.0
-                planes[class_id, r, c] = 1.0
-        planes[UNOBSERVED] = ~planes[1:].any(0)
-        return planes
+        view = (np.hypot(x, y) < range_m) & (np.abs(np.arctan2(y, x)) < half_angle_rad)
+        spots = np.stack(np.meshgrid(*[np.linspace(-0.2, 0.2, 5)] * 2), -1).reshape(-1, 2)
+        for middle, class_id in zip(self.middles, self.class_id, strict=True):
+            seen = map_from_robot.inverse().apply(middle + spots)
+            column, row = np.floor(seen / CELL_M + SIDE / 2).astype(int).T
+            inside = (row >= 0) & (row < SIDE) & (column >= 0) & (column < SIDE)
+            np.add.at(planes[class_id], (row[inside], column[inside]), np.float32(1 / len(spots)))
+        planes *= view
+        planes[FREE_FLOOR] = view & ~planes[FIRST_OBJECT:].any(0)
+        planes[UNOBSERVED] = ~view
+        return np.minimum(planes, np.float32(1.0))
 
 
-def make_world(objects: int = 24, half_m: float = 4.0, seed: int = 0) -> World:
+def make_world(objects: int = 40, half_m: float = 4.0, seed: int = 0) -> World:
     """Objects of all classes at random places."""
     random = np.random.default_rng(seed)
     class_id = FIRST_OBJECT + np.arange(objects) % (len(CLASSES) - FIRST_OBJECT)

@@ -138,7 +138,7 @@ def read_or_refuse(path: Path) -> str:
 def test_every_rosbag2_log_is_read_or_refused_by_name() -> None:
     """Twenty logs as ROS 2 recorders write them, checksums or not, with services and unusual schemas."""
     files = sorted(data_folder("mcap-rosbag2").rglob("*.mcap"))
-    outcomes = {str(path.name): read_or_refuse(path) for path in files}
+    outcomes = {str(path.parent.name) + path.name: read_or_refuse(path) for path in files}
     print(f"{list(outcomes.values()).count('read')} of {len(files)} rosbag2 logs read")
     assert len(files) == 20
     assert set(outcomes.values()) <= {"read", "refused"}, outcomes

@@ -26,7 +26,7 @@ from semslam.logs.reader import LogReader, LossReport
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Three sound logs with image-sized payloads: zstd, lz4 and no compression."""
-    return make_logs(tmp_path_factory.mktemp("logs"), frames=30)
+    return make_logs(tmp_path_factory.mktemp("logs"), frames=60)
 
 
 def read(path: Path) -> tuple[Counter[Fingerprint], LossReport]:
@@ -47,15 +47,15 @@ def test_random_damage_never_lets_a_wrong_message_through(logs: list[Path]) -> N
 
 
 def test_one_flipped_bit_costs_little(logs: list[Path]) -> None:
-    """A flipped bit costs one chunk of nine at most, wherever it falls."""
+    """A flipped bit costs one chunk of about nine, wherever it falls."""
     tally = run_cases(logs, {"flip": KINDS["flip"]}, cases=30, seed=11)["flip"]
-    assert min(tally.shares) > 0.6
-    assert sum(tally.shares) / len(tally.shares) > 0.8
+    assert min(tally.shares) > 0.8
+    assert sum(tally.shares) / len(tally.shares) > 0.88
 
 
 def test_harder_damage_lets_nothing_wrong_through_either(logs: list[Path]) -> None:
     """Many flips, lost bytes, blocks out of place, holes before a cut, and flips where the structure is dense."""
-    tallies = run_cases(logs, HARD_KINDS, cases=60, seed=3)
+    tallies = run_cases(logs, HARD_KINDS, cases=40, seed=3)
     assert [tally.failures for tally in tallies.values()] == [[], [], [], [], []]
     assert sum(tally.wrong + tally.crashes + tally.disordered for tally in tallies.values()) == 0
 

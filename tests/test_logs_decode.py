@@ -619,6 +619,15 @@ def test_an_uncalibrated_foxglove_camera_has_zero_matrices() -> None:
     assert info == CameraInfo(0, "", 640, 480, "", (), (0.0,) * 9, (0.0,) * 9, (0.0,) * 12)
 
 
+def test_a_foxglove_imu_without_an_orientation_says_so() -> None:
+    """By a covariance of -1, or by an all-zero quaternion."""
+    channel = Channel("/imu", "foxglove.Imu", "jsonschema", b"{}", "json", {})
+    fields = {"angular_velocity": {"x": 1}, "linear_acceleration": {"z": 9}, "orientation": {"w": 1}}
+    for change in ({"orientation_covariance": [-1] + [0] * 8}, {"orientation": {"w": 0}}):
+        imu = decoder_for(channel)(json.dumps(fields | change).encode())
+        assert imu == Imu(0, "", (1.0, 0.0, 0.0), (0.0, 0.0, 9.0), None)
+
+
 @pytest.mark.parametrize(
     ("schema_name", "text", "reason"),
     [

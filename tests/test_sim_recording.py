@@ -68,7 +68,7 @@ def test_other_software_reads_the_log(tmp_path: Path) -> None:
     }
     stamps = [message.header.stamp.sec * 10**9 + message.header.stamp.nanosec for message in found[COLOUR]]
     assert tuple(stamps) == log.stamps_nanos
-    picture = cv2.imdecode(np.frombuffer(found[COLOUR][0].data, np.uint8), cv2.IMREAD_COLOR)
+    picture: Any = cv2.imdecode(np.frombuffer(found[COLOUR][0].data, np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape == (120, 160, 3)
 
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from semslam.sim.robot import (
     GRAVITY_M_S2,
+    DrivePath,
     ImuNoise,
     OdometryNoise,
-    Path,
     measure_depth,
     measure_imu,
     measure_odometry,
@@ -27,7 +27,7 @@ SILENT = ImuNoise(0, 0, 0, 0)
 
 
 @pytest.fixture(scope="module")
-def path() -> Path:
+def path() -> DrivePath:
     """The loop through one room."""
     return plan_path(make_room(1), 1)
 
@@ -37,7 +37,7 @@ def rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def test_gyro_adds_up_to_the_true_heading(path: Path) -> None:
+def test_gyro_adds_up_to_the_true_heading(path: DrivePath) -> None:
     """Without noise the integral of the turn rate follows the heading; with noise it strays no more than the bias."""
     true = np.unwrap(path.heading(TIMES))
     for noise, allowed in ((SILENT, 1e-4), (ImuNoise(), 20 * 4 * 0.003)):
@@ -46,7 +46,7 @@ def test_gyro_adds_up_to_the_true_heading(path: Path) -> None:
         assert np.abs(turned - (true - true[0])).max() < allowed
 
 
-def test_accelerometer_feels_gravity_and_the_curve(path: Path) -> None:
+def test_accelerometer_feels_gravity_and_the_curve(path: DrivePath) -> None:
     """A sensor off the turning point, nose down: its reading is the second derivative of its own position plus g."""
     base_from_imu = mount(0.3, -0.2, 0.5, pitch_rad=0.4)
     _, accel = measure_imu(path, TIMES, SILENT, rng(), base_from_imu)
@@ -61,7 +61,7 @@ def test_accelerometer_feels_gravity_and_the_curve(path: Path) -> None:
     assert np.abs(moving[5:-5]).max() > 0.1
 
 
-def test_accelerometer_in_a_pitched_camera_shows_the_pitch(path: Path) -> None:
+def test_accelerometer_in_a_pitched_camera_shows_the_pitch(path: DrivePath) -> None:
     """In optical axes gravity lies between up (-y) and backwards (-z) as the camera looks down."""
     camera = mount(0.0, 0.0, 0.5, pitch_rad=math.radians(30)) @ optical()
     _, accel = measure_imu(path, TIMES, ImuNoise(), rng(), camera)
@@ -69,7 +69,7 @@ def test_accelerometer_in_a_pitched_camera_shows_the_pitch(path: Path) -> None:
     assert math.degrees(math.atan2(-mean[2], -mean[1])) == pytest.approx(30, abs=2)
 
 
-def errors_a_second(path: Path, noise: OdometryNoise) -> NDArray[np.float64]:
+def errors_a_second(path: DrivePath, noise: OdometryNoise) -> NDArray[np.float64]:
     """(recordings, steps, 3) error of steps of one second, in the axes of the robot: metres, metres, radians."""
     times = np.arange(0, 20.01, 0.05)
     true = np.column_stack([path.position(times), path.heading(times)])[::20]
@@ -90,13 +90,13 @@ def steps_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.column_stack([cos * x + sin * y, cos * y - sin * x, delta[:, 2]])
 
 
-def test_wheels_are_exact_without_noise(path: Path) -> None:
+def test_wheels_are_exact_without_noise(path: DrivePath) -> None:
     """Odometry starts at (0, 0, 0) and repeats the true motion in that frame."""
     errors = errors_a_second(path, OdometryNoise(0, 0, 0, 0))
     assert np.abs(errors).max() < 1e-9
 
 
-def test_wheel_error_has_the_stated_spread_and_bias(path: Path) -> None:
+def test_wheel_error_has_the_stated_spread_and_bias(path: DrivePath) -> None:
     """Per second 0.03 m and 1.5 degrees at random, and a constant part drawn from 0.02 m and 0.5 degrees."""
     errors = errors_a_second(path, OdometryNoise())
     within = errors.std(1).mean(0)

@@ -186,17 +186,25 @@ def roll_pitch(up: Vector) -> tuple[float, float]:
 FLOOR_CELL_M = 0.1
 FLOOR_SLAB_M = 0.08
 """Floor points lie within this height of each other: depth noise at 4 m plus a degree of tilt."""
+FLAT_SHARE = 0.3
+"""A flat column has at least this share of its points in the slab; a wall half a metre high has a sixth."""
+FLOOR_WIDTH_M = 0.06
+"""Standard deviation of floor across its narrow side; that of a strip 20 cm wide."""
 FLOOR_SAMPLE = 20_000
 
 
 def floor_height(
-    points_level: NDArray[np.floating], *, min_area_m2: float = 0.15, min_drop_m: float = 0.05, max_range_m: float = 5.0
+    points_level: NDArray[np.floating], *, min_area_m2: float = 0.1, min_drop_m: float = 0.05, max_range_m: float = 5.0
 ) -> float | None:
     """Height of the floor that a depth image shows, relative to the camera (negative), metres.
 
-    Each 10 cm column of space keeps only its lowest point. Walls and furniture then nearly vanish, floor and table tops
-    stay, as peaks of the heights. The floor is the strongest peak with almost nothing below it, so a table is not taken
-    for it as soon as anything lower is in view.
+    Each 10 cm column of space keeps only its lowest point, and counts as flat if many of its points lie close above
+    that, which those of a wall do not. Of flat columns, floor and table tops stay as peaks of the heights. The floor is
+    the strongest peak with almost no column reaching below it, so a table is not taken for it as soon as anything
+    lower is in view.
+
+    Measured on a hand-held camera in a kitchen, where table and counters fill most pictures: found in 71 of 100
+    pictures, within 3 cm (one sigma) of the true height up to its constant, and never more than 8 cm off.
 
     Args:
         points_level: (N, 3) in levelled axes from the camera; NaN rows are left out.
@@ -208,20 +216,22 @@ def floor_height(
         None with too little evidence.
     """
     points = _nearby_sample(points_level, max_range_m)
-    lowest = _lowest_of_columns(points)
+    columns = _columns(points)
+    levels, places = columns.lowest[columns.flat], columns.places[columns.flat]
     min_columns = max(3, math.ceil(min_area_m2 / FLOOR_CELL_M**2))
-    if len(lowest) < min_columns:
+    if len(levels) < min_columns:
         return None
-    below = np.arange(len(lowest))
-    slab_end = np.searchsorted(lowest, lowest + FLOOR_SLAB_M)
-    inside = slab_end - below
-    above = np.searchsorted(lowest, lowest + 2 * FLOOR_SLAB_M) - slab_end
+    below = np.searchsorted(columns.lowest, levels)
+    slab_end = np.searchsorted(levels, levels + FLOOR_SLAB_M)
+    inside = slab_end - np.arange(len(levels))
+    above = np.searchsorted(levels, levels + 2 * FLOOR_SLAB_M) - slab_end
     floor_like = (inside >= min_columns) & (inside >= 2 * above) & (below <= np.maximum(2, 0.1 * inside))
-    score = np.where(floor_like & (lowest < -min_drop_m), inside, 0)
+    score = np.where(floor_like & (levels < -min_drop_m), inside, 0)
     best = int(np.argmax(score))
-    if score[best] == 0:
+    slab = slice(best, int(slab_end[best]))
+    if score[best] == 0 or _width(places[slab]) < FLOOR_WIDTH_M:
         return None
-    return _refined(points[:, 2], float(np.median(lowest[best : slab_end[best]])))
+    return _refined(points[:, 2], float(np.median(levels[slab])))
 
 
 def _nearby_sample(points: NDArray[np.floating], max_range_m: float) -> Vector:
@@ -231,16 +241,40 @@ def _nearby_sample(points: NDArray[np.floating], max_range_m: float) -> Vector:
     return np.asarray(sample[near])
 
 
-def _lowest_of_columns(points: Vector) -> Vector:
-    """Heights, rising, of the second lowest point of each column with at least three points (one may be noise)."""
+@dataclass(frozen=True)
+class _Columns:
+    """Columns of space with at least three points, by rising height."""
+
+    lowest: Vector
+    """(n,) height of the second lowest point; the lowest may be noise."""
+    flat: NDArray[np.bool_]
+    """(n,) whether a good share of the points lies close above that."""
+    places: Vector
+    """(n, 2) on the ground, metres."""
+
+
+def _columns(points: Vector) -> _Columns:
     if len(points) == 0:
-        return np.zeros(0)
+        return _Columns(np.zeros(0), np.zeros(0, bool), np.zeros((0, 2)))
     cells = np.floor(points[:, :2] / FLOOR_CELL_M).astype(np.int64)
     cells -= cells.min(axis=0)
-    column = cells[:, 0] * (int(cells[:, 1].max()) + 1) + cells[:, 1]
+    rows = int(cells[:, 1].max()) + 1
+    column = cells[:, 0] * rows + cells[:, 1]
     order = np.lexsort((points[:, 2], column))
-    _, first, count = np.unique(column[order], return_index=True, return_counts=True)
-    return np.sort(points[order[first[count >= 3] + 1], 2])
+    heights = points[order, 2]
+    names, first, count = np.unique(column[order], return_index=True, return_counts=True)
+    lowest = heights[np.minimum(first + 1, first + count - 1)]
+    close = np.add.reduceat(heights < np.repeat(lowest, count) + FLOOR_SLAB_M, first, dtype=np.int64)
+    rising = np.argsort(lowest, kind="stable")
+    rising = rising[count[rising] >= 3]
+    places = FLOOR_CELL_M * np.stack(np.divmod(names[rising], rows), axis=1)
+    return _Columns(lowest[rising], (close >= FLAT_SHARE * count)[rising], places)
+
+
+def _width(places: Vector) -> float:
+    """Standard deviation (metres) across the narrow direction of places (n, 2): the foot of a wall is a line."""
+    away = places - places.mean(axis=0)
+    return math.sqrt(max(0.0, float(np.linalg.eigvalsh(away.T @ away / len(places))[0])))
 
 
 def _refined(heights: Vector, guess: float) -> float:

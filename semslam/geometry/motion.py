@@ -20,7 +20,7 @@ from semslam.geometry.timeline import Timeline
 
 Vector = NDArray[np.float64]
 
-VELOCITY_MEMORY_S = 1.0
+VELOCITY_MEMORY_S = 2.0
 """Time in which a carried velocity fades to 1/e, seconds."""
 MAX_SPEED_M_S = 3.0
 """A faster velocity is drift, and forgotten."""

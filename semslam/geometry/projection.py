@@ -7,8 +7,8 @@ Two kinds of pixels would smear objects over the floor, and are left out of them
 
 * A *flying* pixel is a mixture of the near and far side of an edge and hangs in the air between them. It is recognised
   by being far from both its neighbours in a row, or in a column, and counts for nothing at all.
-* A pixel of the *background* that an imprecise mask covers lies beyond a gap in range. A mask keeps the pixels around
-  the mode of its ranges up to the first gap on either side; what it loses counts as floor or obstacle like any other.
+* A pixel of the *background* that an imprecise mask covers lies beyond a gap in range. Of the stretches between gaps a
+  mask keeps the one with most pixels; what it loses counts as floor or obstacle like any other.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ FLYING_SHARE = 0.03
 """A neighbour further away than FLYING_M + FLYING_SHARE * distance lies across an edge; a floor seen flat does not."""
 RANGE_BIN_M = 0.1
 RANGE_GAP_BINS = 3
-"""A mask ends where its histogram of ranges stays empty for so many bins."""
+"""A step of more bins than this from one filled bin to the next is a gap."""
 RANGE_EMPTY_SHARE = 0.02
-"""A bin with a smaller share of the mode's pixels is empty."""
+"""A bin with a smaller share of the fullest bin's pixels is empty."""
 
 
 def points_in_robot(
@@ -145,7 +145,7 @@ def flying(points: Points, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def main_body(points: Points, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The part (H, W) of a mask around the mode of its ranges, up to the first gap on either side.
+    """The part (H, W) of a mask in the stretch of ranges that holds most of its pixels; stretches end at gaps.
 
     The range is the distance from the robot's origin along the ground.
     """
@@ -154,13 +154,11 @@ def main_body(points: Points, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         return mask
     bins = (ranges / np.float32(RANGE_BIN_M)).astype(np.int64)
     counts = np.bincount(bins)
-    mode = int(np.argmax(counts))
-    filled = np.flatnonzero(counts >= max(1.0, RANGE_EMPTY_SHARE * float(counts[mode])))
-    gaps = np.diff(filled) > RANGE_GAP_BINS
-    at = int(np.searchsorted(filled, mode))
-    before, after = np.flatnonzero(gaps[:at]), np.flatnonzero(gaps[at:])
-    low = filled[before[-1] + 1] if before.size else filled[0]
-    high = filled[at + after[0]] if after.size else filled[-1]
+    filled = np.flatnonzero(counts >= max(1.0, RANGE_EMPTY_SHARE * float(counts.max())))
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(filled) > RANGE_GAP_BINS) + 1])
+    most = int(np.argmax(np.add.reduceat(counts[filled], starts)))
+    low = filled[starts[most]]
+    high = filled[starts[most + 1] - 1] if most + 1 < len(starts) else filled[-1]
     body = np.zeros_like(mask)
     body[mask] = (bins >= low) & (bins <= high)
     return body

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 from semslam.errors import SemslamError
+from semslam.logs.channels import Channel
 from semslam.logs.decode_foxglove import FOXGLOVE_TYPES, decode_json, decode_protobuf
 from semslam.logs.decode_ros import ROS_TYPES, decode_cdr, decode_ros1
 from semslam.logs.messages import Message
 from semslam.logs.ros_definition import short_name
-
-if TYPE_CHECKING:
-    from semslam.logs.channels import Channel
 
 Decoder: TypeAlias = Callable[[bytes], Message]
 

@@ -152,11 +152,11 @@ def _summary(source: Source, definitions: Definitions, losses: FileLosses) -> Su
     """The summary, its definitions taken in; None and a note where it cannot be believed."""
     try:
         summary = read_summary(source)
+        _define(summary, definitions)
     except DamagedRecordError as error:
         losses.summary_damaged = True
         losses.note(f"summary not used: {error}")
         return None
-    _define(summary, definitions)
     return summary
 
 
@@ -170,13 +170,18 @@ def _displaced_summary(source: Source, data_end: int | None, definitions: Defini
         return None
     try:
         summary = read_displaced_summary(source, data_end)
+        _define(summary, definitions)
     except DamagedRecordError:
         return None
-    _define(summary, definitions)
     return summary
 
 
 def _define(summary: Summary, definitions: Definitions) -> None:
+    """Take in every schema and channel, or none: DamagedRecordError where one cannot be parsed."""
+    for body in summary.schemas:
+        definitions.pool.schema(body)
+    for body in summary.channels:
+        definitions.pool.record(body)
     scope = Scope(definitions, summary.verified)
     for body in summary.schemas:
         scope.add_schema(body)

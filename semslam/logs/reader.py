@@ -16,7 +16,7 @@ The last, cut chunk of an unfinished file is left out as well: only a whole chun
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 from semslam.errors import SemslamError
@@ -73,11 +73,11 @@ class LogReader:
         order of `paths` and, within a file, of its bytes. The order is broken only by `losses.late_messages`.
 
         Args:
-            wanted: asked once or a few times per channel; messages it refuses are verified but never copied.
+            wanted: asked once per channel; messages it refuses are verified but never copied.
         """
         readings = [FileReading(file, file.losses.copy()) for file in self._files]
         self.losses = LossReport([reading.losses for reading in readings])
-        yield from Merge(readings, wanted or _everything, self._memory_bytes).messages()
+        yield from Merge(readings, cache(wanted or _everything), self._memory_bytes).messages()
         for reading in readings:
             reading.finish()
 

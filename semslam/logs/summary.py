@@ -19,9 +19,7 @@ from semslam.logs.records import (
     ChunkIndex,
     DamagedRecordError,
     Statistics,
-    parse_channel,
     parse_chunk_index,
-    parse_schema,
     parse_statistics,
 )
 from semslam.logs.source import Source, read_exactly
@@ -135,10 +133,8 @@ def _check_crc(handle: BinaryIO, start: int, footer: _Footer) -> bool:
 def _fill(summary: Summary, handle: BinaryIO, start: int, end: int) -> None:
     for opcode, body in _records(handle, start, end):
         if opcode == Opcode.SCHEMA:
-            parse_schema(body)
             summary.schemas.append(body)
         elif opcode == Opcode.CHANNEL:
-            parse_channel(body)
             summary.channels.append(body)
         elif opcode == Opcode.CHUNK_INDEX:
             summary.chunks.append(parse_chunk_index(body))

@@ -109,15 +109,12 @@ class Ros2LogWriter:
         Raises:
             LogWriteError: the topic already carries another type, a number does not fit, or the disk is full.
         """
+        publish_time_nanos = log_time_nanos if publish_time_nanos is None else publish_time_nanos
+        data = _serialised(topic, message, log_time_nanos, publish_time_nanos)
         writer = self._open_writer()
         channel = self._channel(writer, topic, ros2_type(message))
-        publish_time_nanos = log_time_nanos if publish_time_nanos is None else publish_time_nanos
         try:
-            writer.add_message(channel.id, log_time_nanos, serialise(message), publish_time_nanos, channel.sequence)
-        except struct.error as error:
-            raise LogWriteError(
-                f"A message for `{topic}` holds a number that does not fit its field: {error}"
-            ) from error
+            writer.add_message(channel.id, log_time_nanos, data, publish_time_nanos, channel.sequence)
         except OSError as error:
             raise LogWriteError(f"Cannot write `{self.path}`: {error.strerror}", hint="Free some space") from error
         channel.sequence += 1
@@ -165,6 +162,16 @@ class _Topic:
         self.id = channel_id
         self.type_name = type_name
         self.sequence = 0
+
+
+def _serialised(topic: str, message: Message | Transform, *times_nanos: int) -> bytes:
+    """The bytes of a message, before anything of it is in the log."""
+    if not all(0 <= time < 2**64 for time in times_nanos):
+        raise LogWriteError(f"A message for `{topic}` has the time {min(times_nanos)} ns, which does not fit a log")
+    try:
+        return serialise(message)
+    except struct.error as error:
+        raise LogWriteError(f"A message for `{topic}` holds a number that does not fit its field: {error}") from error
 
 
 def encode_jpeg(rgb: NDArray[np.uint8], quality: int = 90) -> bytes:

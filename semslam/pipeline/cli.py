@@ -33,14 +33,14 @@ def main(arguments: Sequence[str] | None = None, stages: Sequence[Stage] | None 
     """Run the command line and exit; `stages` replaces the catalogue."""
     os.environ.update(ONE_THREAD)  # before numpy is imported, which reads them once
     signal.signal(signal.SIGTERM, _interrupt)
-    sys.exit(_guarded(arguments, stages))
+    sys.exit(run_command(arguments, stages))
 
 
 def _interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def _guarded(arguments: Sequence[str] | None, stages: Sequence[Stage] | None) -> int:
+def run_command(arguments: Sequence[str] | None, stages: Sequence[Stage] | None) -> int:
     """Run, and turn whatever is thrown into a message and an exit code."""
     try:
         result = cli.main(arguments, prog_name="semslam", standalone_mode=False, obj=stages)
@@ -83,7 +83,14 @@ def _console(*, quiet: bool = False) -> Console:
 
 def _print(value: Any, as_json: bool) -> None:
     """Data: its text for people, or its JSON for machines."""
-    click.echo(json.dumps(value.as_json(), indent=1, ensure_ascii=False) if as_json else value.text())
+    if as_json:
+        _print_json(value.as_json())
+    else:
+        click.echo(value.text())
+
+
+def _print_json(value: Any) -> None:
+    click.echo(json.dumps(value, indent=1, ensure_ascii=False))
 
 
 def _stages(context: click.Context) -> tuple[Stage, ...]:
@@ -166,8 +173,8 @@ def _run(context: click.Context, until: str, given: Mapping[str, Any]) -> int:
     )
     outcome = run(request, _stages(context), _console(quiet=given["quiet"]))
     if given["as_json"]:
-        click.echo(json.dumps(outcome, indent=1, ensure_ascii=False))
-    return int(outcome["exit_code"])
+        _print_json(outcome.as_json())
+    return outcome.exit_code
 
 
 class _InOrder(click.Group):
@@ -214,10 +221,10 @@ def demo(context: click.Context, out: Path, workers: int | None, as_json: bool, 
     request = RunRequest([str(log)], out, _stages(context)[-1].name, "demo", options=settings, workers=workers)
     outcome = run(request, _stages(context), console)
     if as_json:
-        click.echo(json.dumps(outcome, indent=1, ensure_ascii=False))
-    elif not outcome["exit_code"]:
+        _print_json(outcome.as_json())
+    elif not outcome.exit_code:
         console.say(f"log: {log}\nnext: `semslam evaluate {out}` compares the tracks with the simulated truth")
-    return int(outcome["exit_code"])
+    return outcome.exit_code
 
 
 @cli.command()
@@ -362,7 +369,7 @@ def why(context: click.Context, /, stage: str, log: str, out: Path, as_json: boo
     config = _config_like(_stages(context), record.config, f"the record of `{record.name}`", given)
     reasons = explain(folder, _stages(context), stage, record, config)
     if as_json:
-        click.echo(json.dumps(reasons_json(record.name, reasons), indent=1, ensure_ascii=False))
+        _print_json(reasons_json(record.name, reasons))
     else:
         click.echo("\n".join(reason.text() for reason in reasons))
 
@@ -490,7 +497,7 @@ def models_inspect(file: Path, as_json: bool) -> None:
     Example:
       semslam models inspect yolox.onnx
     """
-    from semslam.models.session import describe
+    from semslam.models.inspect import describe
 
     _print(describe(file), as_json)
 
@@ -521,7 +528,7 @@ def _check(context: click.Context, given: Mapping[str, Any]) -> int:
         check_log(log.sources, resolved.of(stages[0]).topics, beside / f"{log.name}.check.png") for log in found.logs
     ]
     if given["as_json"]:
-        click.echo(json.dumps([report.as_json() for report in reports], indent=1, ensure_ascii=False))
+        _print_json([report.as_json() for report in reports])
     else:
         click.echo("\n\n".join(report.text() for report in reports))
     for problem in found.problems:

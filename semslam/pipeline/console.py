@@ -33,7 +33,7 @@ class Console:
     def __init__(self, stream: TextIO | None = None, *, quiet: bool = False) -> None:
         self.stream = stream or sys.stderr
         self.quiet = quiet
-        self.terminal = self.stream.isatty() and os.environ.get("TERM") != "dumb"
+        self.terminal = self.stream.isatty() and os.environ.get("TERM") != "dumb" and _columns(self.stream) > 0
         self._coloured = self.terminal and not os.environ.get("NO_COLOR")
 
     def colour(self, text: str, name: str) -> str:
@@ -56,6 +56,14 @@ class Console:
     def error(self, error: SemslamError) -> None:
         """An error as the user gets it."""
         self.line(f"{self.colour('error:', 'red')} {error.text()}")
+
+
+def _columns(stream: TextIO) -> int:
+    """Width of a terminal; 0 where it does not tell, as under some recorders, and bars would be invisible."""
+    try:
+        return os.get_terminal_size(stream.fileno()).columns
+    except OSError:
+        return 0
 
 
 @dataclass
@@ -192,8 +200,8 @@ def bytes_text(number: int) -> str:
     return f"{size:.1f} GB"
 
 
-def say_end(console: Console, report: RunReport, places: Sequence[str], stale: Sequence[str]) -> None:
-    """The last lines of a run: warnings, failures, and where the results lie."""
+def say_end(console: Console, report: RunReport, out: str, places: Sequence[str], stale: Sequence[str]) -> None:
+    """The last lines of a run: warnings, failures, and where the results lie; `stale` are folders with older ones."""
     new = [r for r in report.results if r.state == "done"]
     warnings = [f"`{r.task.log.name}` {r.task.name}: {text}" for r in new if r.entry for text in r.entry.warnings]
     for text in warnings[:MAX_LINES]:
@@ -202,22 +210,22 @@ def say_end(console: Console, report: RunReport, places: Sequence[str], stale: S
     old = sum(len(r.entry.warnings) for r in report.results if r.state == "cached" and r.entry)
     if hidden or old:
         counts = [f"{hidden} more"] * bool(hidden) + [f"{old} of results made before"] * bool(old)
-        console.say(f"warnings: {' and '.join(counts)}; `semslam status OUT` lists them")
-    _say_failures(console, report.failures)
+        console.say(f"warnings: {' and '.join(counts)}; `semslam status {out}` lists them")
+    _say_failures(console, report.failures, out)
     for text in stale[:MAX_LINES]:
         console.warn(f"`{text}` still holds the result of an earlier run")
     if places:
         console.say(f"results: {places[0]}" + (f" and {len(places) - 1} more" if len(places) > 1 else ""))
 
 
-def _say_failures(console: Console, failures: Sequence[TaskResult]) -> None:
+def _say_failures(console: Console, failures: Sequence[TaskResult], out: str) -> None:
     for result in failures[:MAX_LINES]:
         failure = result.failure
         if failure is not None:
             title = f"{result.task.name} of `{result.task.log.name}` failed: {failure.message}"
             console.error(SemslamError(title, hint=failure.hint, details=failure.details))
     if len(failures) > MAX_LINES:
-        console.line(f"{len(failures) - MAX_LINES} more failures: see `semslam status`")
+        console.line(f"{len(failures) - MAX_LINES} more failures: see `semslam status {out}`")
 
 
 class _Progress:
@@ -274,14 +282,14 @@ class _Lines(_Progress):
         self._running[key] = (task, start, done if first is None else first, done, total)
 
     def settled(self, key: str, result: TaskResult) -> None:
-        """Say how it ended, unless it was cached."""
+        """Say how it ended; what is cached or blocked shows in the table."""
         self._running.pop(key, None)
         name = f"{result.task.log.name} {result.task.name}"
         if result.state == "done" and result.entry:
             rows = sum(result.entry.rows.values())
             self._console.say(f"{name}: done, {rows:,} rows in {result.seconds:.1f} s")
-        elif result.state != "cached":
-            self._console.say(f"{name}: {result.state}")
+        elif result.state == "failed":
+            self._console.say(f"{name}: failed")
 
     def tick(self) -> None:
         """Every ten seconds, say how far everything is."""
@@ -368,7 +376,7 @@ def _bar(console: Console, name: str, unit: str, total: int | None, *, unit_scal
 
     return tqdm(
         desc=name,
-        unit=unit,
+        unit=unit if unit_scale else f" {unit}",
         total=total,
         unit_scale=unit_scale,
         leave=False,

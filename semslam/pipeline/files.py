@@ -15,9 +15,12 @@ TEMPORARY = ".tmp-"
 """Beginning of the name of anything unfinished; nobody reads it, `clean` removes it."""
 
 
+_CANONICAL = json.JSONEncoder(sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+
+
 def canonical_json(value: Any) -> str:
     """The one JSON text of a value: sorted keys, no spaces, no NaN. Equal values give equal bytes."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return _CANONICAL.encode(value)
 
 
 def write_text(path: Path, text: str, *, durable: bool = False) -> None:

@@ -108,11 +108,15 @@ class Planner:
         self._digests = digests
         self._published = published
         self._settings: dict[tuple[str, str], dict[str, Any]] = {}
+        self._needs: dict[tuple[str, str], tuple[tuple[str, str], ...]] = {}
 
     def needs(self, task: Task) -> tuple[tuple[str, str], ...]:
         """(stage, variant) of the tasks of the same log that this one reads from."""
-        names = dict.fromkeys(table.stage for table in task.stage.reads)
-        return tuple((name, self._variant_before(name, task.variant)) for name in names)
+        place = (task.stage.name, task.variant)
+        if place not in self._needs:
+            names = dict.fromkeys(table.stage for table in task.stage.reads)
+            self._needs[place] = tuple((name, self._variant_before(name, task.variant)) for name in names)
+        return self._needs[place]
 
     def _variant_before(self, stage: str, variant: str) -> str:
         """Variant of an earlier stage that a task of `variant` reads."""
@@ -150,12 +154,7 @@ class Planner:
             "version": stage.version,
             "variant": task.variant,
             "config": self._settings_of(task),
-            "inputs": {
-                table.name: before[table.stage, self._variant_before(table.stage, task.variant)].tables.get(
-                    table.name, ABSENT
-                )
-                for table in stage.reads
-            },
+            "inputs": self._input_digests(task, before),
             "spec": SPEC_VERSION,
         }
         if stage.name == self._published:
@@ -163,6 +162,14 @@ class Planner:
         if stage.from_log:
             value["sources"] = [self._source_digest(path) for path in task.log.sources]
         return value
+
+    def _input_digests(self, task: Task, before: Mapping[tuple[str, str], Entry]) -> dict[str, str]:
+        """Digest of every table the task reads."""
+        variants = dict(self.needs(task))
+        return {
+            table.name: before[table.stage, variants[table.stage]].tables.get(table.name, ABSENT)
+            for table in task.stage.reads
+        }
 
     def decide(self, task: Task, before: Mapping[tuple[str, str], Entry], record: TaskRecord | None) -> Decision:
         """Whether the task has a result, and if not, why it has to run."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import dataclass
 from typing import Any
 
 from semslam.pipeline.discover import Problem
@@ -13,24 +14,37 @@ REPORT_FORMAT = "semslam-run"
 REPORT_VERSION = 1
 
 
-def run_json(folder: OutputFolder, report: RunReport, problems: tuple[Problem, ...], exit_code: int) -> dict[str, Any]:
-    """Tasks with decisions, digests, warnings and failures; paths as given on the command line."""
-    logs: dict[str, dict[str, Any]] = {}
-    for result in report.results:
-        log = result.task.log
-        place = logs.setdefault(log.name, {"log": log.name, "sources": [str(s) for s in log.sources], "tasks": []})
-        place["tasks"].append(task_json(result))
-    return {
-        "format": REPORT_FORMAT,
-        "version": REPORT_VERSION,
-        "out": str(folder.root),
-        "results": str(folder.results),
-        "counts": dict(sorted(Counter(result.state for result in report.results).items())),
-        "seconds": round(report.seconds, 3),
-        "logs": list(logs.values()),
-        "unreadable": [{"path": str(problem.path), "reason": problem.reason} for problem in problems],
-        "exit_code": exit_code,
-    }
+@dataclass(frozen=True)
+class RunOutcome:
+    """A finished run; `problems` are files that could not even be opened."""
+
+    folder: OutputFolder
+    report: RunReport
+    problems: tuple[Problem, ...]
+
+    @property
+    def exit_code(self) -> int:
+        """1 if anything failed, else 0."""
+        return 1 if self.report.failures or self.problems else 0
+
+    def as_json(self) -> dict[str, Any]:
+        """Tasks with decisions, digests, warnings and failures."""
+        logs: dict[str, dict[str, Any]] = {}
+        for result in self.report.results:
+            log = result.task.log
+            place = logs.setdefault(log.name, {"log": log.name, "sources": [str(s) for s in log.sources], "tasks": []})
+            place["tasks"].append(task_json(result))
+        return {
+            "format": REPORT_FORMAT,
+            "version": REPORT_VERSION,
+            "out": str(self.folder.root),
+            "results": str(self.folder.results),
+            "counts": dict(sorted(Counter(result.state for result in self.report.results).items())),
+            "seconds": round(self.report.seconds, 3),
+            "logs": list(logs.values()),
+            "unreadable": [{"path": str(problem.path), "reason": problem.reason} for problem in self.problems],
+            "exit_code": self.exit_code,
+        }
 
 
 def task_json(result: TaskResult) -> dict[str, Any]:

@@ -29,10 +29,10 @@ class Results:
     def publish(self, log: str, variant: str, entry: Entry) -> None:
         """Make the folder of a log and variant hold the files of the entry; others' files in it are left alone."""
         place = f"{log}/{variant}"
-        target = self._folder.results / log / variant
         known = self.known(log, variant)
-        if known["key"] == entry.key and _untouched(target, known["files"]):
+        if known["key"] == entry.key and _untouched(f"{self._folder.results}/{place}", known["files"]):
             return
+        target = self._folder.results / log / variant
         source = self._folder.stage(entry.stage) / entry.key
         names = result_names(load_manifest(source) or {})
         target.mkdir(parents=True, exist_ok=True)
@@ -72,7 +72,7 @@ def result_names(manifest: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return names
 
 
-def _untouched(folder: Path, stamps: Mapping[str, list[int]]) -> bool:
+def _untouched(folder: str, stamps: Mapping[str, list[int]]) -> bool:
     try:
         return all(FileStamp.of(f"{folder}/{name}").as_list() == stamp for name, stamp in stamps.items())
     except OSError:

@@ -14,8 +14,8 @@ from semslam.pipeline.discover import Discovery, Log, discover
 from semslam.pipeline.executors import Executor, ProcessPool, SerialExecutor, usable_cpus
 from semslam.pipeline.folder import OutputFolder, create_folder
 from semslam.pipeline.plan import stages_until, variants_of
-from semslam.pipeline.record import load_records
-from semslam.pipeline.report import run_json
+from semslam.pipeline.record import RecordBook
+from semslam.pipeline.report import RunOutcome
 from semslam.pipeline.runner import Runner, RunReport
 from semslam.stages.contract import Stage
 
@@ -41,18 +41,19 @@ class RunRequest:
     workers: int | None = None
 
 
-def run(request: RunRequest, stages: Sequence[Stage], console: Console) -> dict[str, Any]:
-    """Do it and say what came of it; returns the run as JSON values, with its `exit_code`."""
+def run(request: RunRequest, stages: Sequence[Stage], console: Console) -> RunOutcome:
+    """Do it and say what came of it."""
     config = load_config(stages, request.config_file, request.assignments, request.options)
     folder = create_folder(request.out)
     with folder.locked():
-        found = discover(request.names, {n: record.sources for n, record in load_records(folder.logs).items()})
+        book = RecordBook(folder.logs)
+        found = discover(request.names, {name: record.sources for name, record in book.records.items()})
         _say_start(console, request, found)
-        report = run_logs(folder, stages, request.until, config, found.logs, request.workers, console)
+        report = run_logs(folder, stages, request.until, config, found.logs, request.workers, console, book)
+    say_end(console, report, str(folder.root), *_places(folder, report, stages[-1].name))
     for problem in found.problems:
         console.error(SemslamError(f"`{problem.path}` was left out: {problem.reason}"))
-    exit_code = 1 if report.failures or found.problems else 0
-    return run_json(folder, report, found.problems, exit_code)
+    return RunOutcome(folder, report, found.problems)
 
 
 def run_logs(
@@ -63,6 +64,7 @@ def run_logs(
     logs: Sequence[Log],
     workers: int | None,
     console: Console,
+    book: RecordBook | None = None,
 ) -> RunReport:
     """Run the stages up to `until` over the logs, and show it."""
     needed = stages_until(stages, until)
@@ -70,13 +72,12 @@ def run_logs(
     number = usable_workers(needed, config, len(logs)) if workers is None else workers
     executor: Executor = ProcessPool(number) if number else SerialExecutor()
     view = RunView(console)
-    runner = Runner(folder, needed, config, logs, executor, view, published, max(1, number))
+    runner = Runner(folder, needed, config, logs, executor, view, published, max(1, number), book)
     try:
         report = runner.run()
     finally:
         view.close()
-    console.say(view.table())
-    say_end(console, report, *_places(folder, report, published))
+    console.say("\n" + view.table() + "\n")
     return report
 
 

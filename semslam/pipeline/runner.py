@@ -119,6 +119,8 @@ class Runner:
     Args:
         stages: those to run, in order; every stage another needs is among them.
         published: name of the stage whose files go to `results`.
+        threads: how many new logs are read at once for their digests.
+        book: the records of the folder, if they were read already.
     """
 
     def __init__(
@@ -131,6 +133,7 @@ class Runner:
         listener: Listener,
         published: str,
         threads: int = 1,
+        book: RecordBook | None = None,
     ) -> None:
         self._folder = folder
         self._stages = tuple(stages)
@@ -141,7 +144,7 @@ class Runner:
         self._threads = threads
         self._index = EntryIndex(folder.cache)
         self._digests = DigestCache(folder.cache / "digests.json")
-        self._book = RecordBook(folder.logs)
+        self._book = book or RecordBook(folder.logs)
         self._results = Results(folder)
         self._planner = Planner(stages, config, folder.cache, self._index, self._digests, published)
         self._states = [
@@ -194,13 +197,13 @@ class Runner:
             self._digests.warm([path for path, _ in missing], self._threads, seen)
             self._digests.save()
         for state in self._states:
-            self._start_record(state)
+            self._start_record(state, resolved)
 
-    def _start_record(self, state: _LogState) -> None:
+    def _start_record(self, state: _LogState, resolved: Mapping[str, Any]) -> None:
         """Bring the record of a log to this run: its files and configuration, and no variants it no longer has."""
         record = self._book.of(state.log.name)
         record.sources = [str(path) for path in state.log.sources]
-        record.config = {**record.config, **self._config.as_json()}
+        record.config = {**record.config, **resolved}
         planned = {task.name for _, task in state.undecided}
         stages = {stage.name for stage in self._stages}
         record.tasks = {n: t for n, t in record.tasks.items() if n in planned or n.split("/")[0] not in stages}

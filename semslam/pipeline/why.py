@@ -89,14 +89,18 @@ def _next_decisions(
 
 def _decide_all(planner: Planner, tasks: Iterator[Task], record: LogRecord) -> Iterator[tuple[str, str]]:
     entries: dict[tuple[str, str], Entry] = {}
+    to_run: dict[tuple[str, str], str] = {}
     for task in tasks:
-        missing = [stage for stage, variant in planner.needs(task) if (stage, variant) not in entries]
-        if missing:
-            yield task.name, f"known once {missing[0]} has run"
+        missing = next((need for need in planner.needs(task) if need in to_run), None)
+        if missing is not None:
+            to_run[task.stage.name, task.variant] = to_run[missing]
+            yield task.name, f"known once {to_run[missing]}"
             continue
         decision = planner.decide(task, entries, record.tasks.get(task.name))
         if decision.entry is not None:
             entries[task.stage.name, task.variant] = decision.entry
+        else:
+            to_run[task.stage.name, task.variant] = f"{task.name} has run, which is: {decision.text}"
         yield task.name, decision.text
 
 

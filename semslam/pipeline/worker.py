@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib.metadata
 import platform
 import re
+import sysconfig
 import time
 import traceback
 from collections.abc import Callable
@@ -69,11 +70,17 @@ def describe(error: Exception) -> Failure:
     if isinstance(error, MemoryError):
         return Failure("memory", "Not enough memory", "run with fewer `--workers`", str(error))
     frames = traceback.extract_tb(error.__traceback__)
-    last = next((frame for frame in reversed(frames) if "/semslam/" in frame.filename), frames[-1])
+    last = next((frame for frame in reversed(frames) if _ours(frame.filename)), frames[-1])
     said = " ".join(str(error).split())[:500]
     message = f"{type(error).__name__} in {_place(last.filename)}:{last.lineno}: {said}"
     trace = "".join(traceback.format_exception(error))
     return Failure("unexpected", message, "this is a bug; report it with the traceback", "", trace)
+
+
+def _ours(filename: str) -> bool:
+    """Whether a file of a traceback belongs to semslam or to a stage, rather than to a library."""
+    libraries = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
+    return "/semslam/" in filename or not filename.startswith((*libraries, "<"))
 
 
 def _place(filename: str) -> str:

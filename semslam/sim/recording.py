@@ -13,7 +13,7 @@ import heapq
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,7 +95,7 @@ class Plan:
 class ToyTruth:
     """What the log was made from."""
 
-    path: FilePath
+    path: Path
     room: ToyRoom
     stamps_nanos: tuple[int, ...]
     """Of every pair."""
@@ -114,7 +114,7 @@ class ToyTruth:
         return self.room.objects
 
 
-def record(path: FilePath, plan: Plan, progress: Callable[[int, int], None] | None = None) -> ToyTruth:
+def record(path: Path, plan: Plan, progress: Callable[[int, int], None] | None = None) -> ToyTruth:
     """Drive, look, write; `progress` hears of pairs done and of all.
 
     Raises:
@@ -172,7 +172,7 @@ class _Drive:
         )
         return [stream() for is_wanted, stream in wanted if is_wanted]
 
-    def truth(self, path: FilePath) -> ToyTruth:
+    def truth(self, path: Path) -> ToyTruth:
         """What was recorded."""
         times = self._image_times
         poses = np.column_stack([self._path.position(times), self._path.heading(times)])

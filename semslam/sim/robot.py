@@ -48,7 +48,7 @@ class OdometryNoise:
 
 
 @dataclass(frozen=True)
-class Path:
+class DrivePath:
     """A closed uniform cubic B-spline through the corridor; any time is allowed, the loop goes on for ever."""
 
     knots: Array
@@ -100,7 +100,7 @@ _B_SPLINE = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]
 """Rows: powers 0 to 3 of the place between two knots; columns: the four control points around it."""
 
 
-def plan_path(room: ToyRoom, seed: int) -> Path:
+def plan_path(room: ToyRoom, seed: int) -> DrivePath:
     """A loop around the table that keeps clear of everything.
 
     Raises:
@@ -118,7 +118,7 @@ def plan_path(room: ToyRoom, seed: int) -> Path:
     if rng.random() < 0.5:
         knots, gaze = knots[::-1].copy(), -gaze
     start, phase = float(rng.uniform(0, _KNOTS)), float(rng.uniform(0, 2 * np.pi))
-    path = Path(knots, _SPEED_M_S * _KNOTS / length, start, gaze, phase)
+    path = DrivePath(knots, _SPEED_M_S * _KNOTS / length, start, gaze, phase)
     times = np.arange(0, _KNOTS / path.knots_per_s, 0.1)
     if clearance_at(clearance, room, path.position(times)).min() < ROBOT_RADIUS_M:
         raise ValueError(f"the furniture leaves no corridor of {2 * ROBOT_RADIUS_M:.2f} m around the table")
@@ -143,7 +143,7 @@ def clearance_at(grid: NDArray[np.float32], room: ToyRoom, xy: Array) -> NDArray
     return grid[rows, columns]
 
 
-def base_pose(path: Path, time_s: float) -> Array:
+def base_pose(path: DrivePath, time_s: float) -> Array:
     """room_from_base, 4x4, at one time."""
     time = np.array([time_s])
     pose = np.eye(4)
@@ -170,7 +170,7 @@ def optical(forward_m: float = 0.0, left_m: float = 0.0, up_m: float = 0.0) -> A
 
 
 def measure_imu(
-    path: Path, time_s: Array, noise: ImuNoise, rng: np.random.Generator, base_from_imu: Array
+    path: DrivePath, time_s: Array, noise: ImuNoise, rng: np.random.Generator, base_from_imu: Array
 ) -> tuple[Array, Array]:
     """Gyro (N, 3) rad/s and accelerometer (N, 3) m/s^2 of a sensor mounted at `base_from_imu` (4x4), in its own axes.
 
@@ -197,7 +197,9 @@ def _error(bias: float, spread: float, samples: int, rng: np.random.Generator) -
     return np.asarray(rng.normal(0, bias, 3) + rng.normal(0, spread, (samples, 3)))
 
 
-def measure_odometry(path: Path, time_s: Array, noise: OdometryNoise, rng: np.random.Generator) -> tuple[Array, Array]:
+def measure_odometry(
+    path: DrivePath, time_s: Array, noise: OdometryNoise, rng: np.random.Generator
+) -> tuple[Array, Array]:
     """Position (N, 2) and heading (N,) that the wheels believe, from (0, 0, 0) at the first time.
 
     The error of a step grows as in `OdometryNoise`: its random part with the root of time, its constant part with

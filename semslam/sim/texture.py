@@ -25,7 +25,7 @@ def noise(u: Array, v: Array) -> Array:
     """Smooth noise of mean 0.5 with detail from 1 cm to 1 m; repeats every 4 m."""
     column = np.floor(u * _TEXELS_PER_M).astype(np.int32) & (_TILE - 1)
     row = np.floor(v * _TEXELS_PER_M).astype(np.int32) & (_TILE - 1)
-    return _noise_tile()[row, column]
+    return np.asarray(_noise_tile()[row, column], np.float32)
 
 
 def _plain(u: Array, v: Array, salt: Array, colour: Array, second: Array) -> Array:

@@ -1,0 +1,76 @@
+"""`semslam models inspect`: what an ONNX file takes and gives, and what semslam would use it for."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from semslam.models.class_names import names_from_metadata
+from semslam.models.detectors import matching
+from semslam.models.session import Signature, open_session
+
+
+@dataclass(frozen=True)
+class ModelDescription:
+    """A model, described."""
+
+    path: str
+    sha256: str
+    bytes: int
+    producer: str
+    provider: str
+    signature: Signature
+    adapter: str
+    """Name of the detector adapter that fits; empty if none does."""
+    classes: int | None
+    """Number of classes the adapter reads from the outputs."""
+    class_names: tuple[str, ...]
+    """As the metadata has them; empty if it has none."""
+    reasons: Mapping[str, str]
+    """Why the other adapters do not fit."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+    def text(self) -> str:
+        """For a terminal."""
+        lines = [f"{self.path}   {self.bytes:,} bytes, sha256 {self.sha256[:16]}...", self.signature.text()]
+        lines += [f"  producer {self.producer or '-'}, runs on {self.provider}", ""]
+        if self.adapter:
+            lines.append(f"detector: adapter {self.adapter}, {self.classes} classes")
+            lines.append(
+                f"class names: {', '.join(self.class_names)}" if self.class_names else "class names: none in it"
+            )
+            if not self.class_names:
+                lines.append("hint: give them with `--classes FILE.txt`")
+        else:
+            lines.append("detector: no adapter fits")
+        lines += [f"  not {name}: {reason}" for name, reason in self.reasons.items()]
+        return "\n".join(lines)
+
+
+def describe(path: Path) -> ModelDescription:
+    """Open a model and describe it.
+
+    Raises:
+        SemslamError: the file is no usable model.
+    """
+    session = open_session(path)
+    adapter, reasons = matching(session.signature)
+    data = path.read_bytes()
+    return ModelDescription(
+        path=str(path),
+        sha256=hashlib.sha256(data).hexdigest(),
+        bytes=len(data),
+        producer=session.signature.producer,
+        provider=session.provider,
+        signature=session.signature,
+        adapter=adapter.name if adapter else "",
+        classes=adapter.classes(session.signature) if adapter else None,
+        class_names=tuple(names_from_metadata(session.signature.metadata) or ()),
+        reasons=reasons,
+    )

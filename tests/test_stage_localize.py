@@ -1,0 +1,224 @@
+"""The localize stage on tables in a folder: whole outputs, and that a run that was cut goes on with the same bytes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from semslam.errors import SemslamError
+from semslam.geometry.frames import SE2
+from semslam.geometry.grid import to_dense
+from semslam.labels import UNOBSERVED
+from semslam.slam.estimator import Step
+from semslam.stages import localize
+from semslam.stages.contract import FinishedShard
+from semslam.stages.settings import LocalizeConfig, PaperConfig
+from semslam.tables.parquet import TableFiles, write_table
+from semslam.tables.spec import CELLS, MOTION, OBSERVATIONS, POSES, SNAPSHOTS
+from tests.slam_world import CELL_M, CLASSES, SIDE, MemoryContext, make_steps, make_walk, make_world, write_inputs
+
+CONFIG = LocalizeConfig(paper=PaperConfig(headings=36, temperature=0.01), shard_frames=4, snapshot_every=3)
+NAMES = ["paper", "paper_visual", "dead_reckoning"]
+
+
+def make_context(
+    folder: Path, steps: list[Step], variant: str = "paper", config: LocalizeConfig = CONFIG
+) -> MemoryContext:
+    inputs = folder / "inputs"
+    inputs.mkdir(parents=True)
+    return MemoryContext(folder / "out", write_inputs(inputs, steps), config, variant)
+
+
+def walk_steps(frames: int = 10) -> list[Step]:
+    return make_steps(make_world(), make_walk(frames), noise_m=0.02)
+
+
+def every_byte(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.mark.parametrize("variant", NAMES)
+def test_whole_output(tmp_path: Path, variant: str) -> None:
+    """One pose a keyframe, snapshots when due and at the end, cells once, all with the class list."""
+    steps = walk_steps()
+    context = make_context(tmp_path, steps, variant)
+    localize.run(context)
+    tables = context.results(POSES, SNAPSHOTS, CELLS)
+    poses, snapshots, cells = (tables[t.name].read() for t in (POSES, SNAPSHOTS, CELLS))
+    assert poses["frame"] == list(range(10))
+    assert poses["stamp_nanos"] == [s.stamp_nanos for s in steps]
+    assert poses["source"][0] == "start"
+    assert (poses["x_m"][0], poses["y_m"][0], poses["heading_rad"][0]) == (0.0, 0.0, 0.0)
+    assert snapshots["frame"] == [2, 5, 8, 9]
+    assert len(cells["ix"]) > 1000
+    assert context.done[-1] == (10, 10)
+    for table in tables.values():
+        assert table.meta == {"classes": list(CLASSES), "cell_m": CELL_M, "estimator": variant}
+
+
+def test_cells_say_what_the_world_holds(tmp_path: Path) -> None:
+    """With right poses every object in sight is on the map under its name, at its place, and little else is."""
+    world = make_world()
+    context = make_context(tmp_path, make_steps(world, make_walk(20)), "dead_reckoning")
+    localize.run(context)
+    cells = context.results(CELLS)["cells"].read()
+    objects = {
+        (x, y): label
+        for x, y, label in zip(cells["x_m"], cells["y_m"], cells["label"], strict=True)
+        if label not in CLASSES[:3]
+    }
+    right = 0
+    for (x, y), label in objects.items():
+        distance = np.hypot(*(world.middles - (x, y)).T)
+        right += label in {CLASSES[class_id] for class_id in world.class_id[distance < 0.45]}
+    assert len(objects) > 200
+    assert right > 0.98 * len(objects)
+    assert cells["x_m"] == pytest.approx([(ix + 0.5) * CELL_M for ix in cells["ix"]])
+
+
+def test_paper_rows_describe_the_field(tmp_path: Path) -> None:
+    """Peak, entropy and modes where there was a field, null and empty where there was none."""
+    context = make_context(tmp_path, walk_steps(4))
+    localize.run(context)
+    poses = context.results(POSES)["poses"].read()
+    assert poses["peak"][0] is None
+    assert poses["mode_x_m"][0] == []
+    for frame in (1, 2, 3):
+        assert 0.0 < poses["peak"][frame] <= 1.0
+        assert poses["entropy_nats"][frame] >= 0.0
+        probability = poses["mode_probability"][frame]
+        assert 1 <= len(probability) <= CONFIG.modes
+        assert probability == sorted(probability, reverse=True)
+        assert probability[0] == pytest.approx(poses["peak"][frame])
+
+
+def test_snapshots_are_the_estimators_own_map(tmp_path: Path) -> None:
+    """The paper's grid for the paper, the cells so far for dead reckoning."""
+    for variant, rows in (("paper", 33), ("dead_reckoning", None)):
+        context = make_context(tmp_path / variant, walk_steps(4), variant)
+        localize.run(context)
+        last = {name: column[-1] for name, column in context.results(SNAPSHOTS)["snapshots"].read().items()}
+        shape = len(CLASSES), last["rows"], last["columns"]
+        planes = to_dense(np.array(last["cells"], np.uint32), np.array(last["weights"], np.float32), shape)
+        assert rows is None or shape[1:] == (rows, rows)
+        assert last["cell_m"] == pytest.approx(0.3 if rows else CELL_M)
+        assert planes[1:].any()
+        assert planes.max() <= 1.0
+        column, row = (int(-last[f"origin_{axis}_m"] // last["cell_m"]) for axis in "xy")
+        assert planes[1:, row, column + 3].any()  # just ahead of the start
+
+
+class Killed(Exception):
+    """Stands for the end of the process."""
+
+
+@pytest.mark.parametrize("variant", NAMES)
+@pytest.mark.parametrize("cut", [1, 2])
+def test_a_cut_run_goes_on_with_the_same_bytes(tmp_path: Path, variant: str, cut: int) -> None:
+    """Every file of every shard, states included."""
+    steps = walk_steps()
+    steps[5] = replace(steps[5], motion=None, observation=None)
+    straight = make_context(tmp_path / "straight", steps, variant)
+    localize.run(straight)
+    resumed = make_context(tmp_path / "resumed", steps, variant)
+
+    def die(done: int, total: int | None = None) -> None:
+        if done > cut * CONFIG.shard_frames:
+            raise Killed
+
+    dying = replace(resumed)
+    dying.progress = die  # type: ignore[method-assign]
+    with pytest.raises(Killed):
+        localize.run(dying)
+    for leftover in (resumed.folder / f"shard-{cut}").iterdir():
+        leftover.unlink()
+    (resumed.folder / f"shard-{cut}").rmdir()
+    resumed.finished = tuple(FinishedShard(i, {}, {}, resumed.folder / f"shard-{i}") for i in range(cut))
+    localize.run(resumed)
+    assert every_byte(resumed.folder) == every_byte(straight.folder)
+
+
+def test_the_size_of_shards_changes_no_row(tmp_path: Path) -> None:
+    """Three shards or one."""
+    rows: list[dict[str, Any]] = []
+    for shard_frames in (4, 100):
+        context = make_context(
+            tmp_path / str(shard_frames), walk_steps(), config=replace(CONFIG, shard_frames=shard_frames)
+        )
+        localize.run(context)
+        rows.append({name: table.read() for name, table in context.results(POSES, SNAPSHOTS, CELLS).items()})
+    assert rows[0] == rows[1]
+
+
+def test_keyframes_without_observation_or_motion(tmp_path: Path) -> None:
+    """A keyframe that extract skipped still gets a row; one without anything gets a null pose, and is counted."""
+    steps = walk_steps(6)
+    steps[2] = replace(steps[2], observation=None)
+    steps[4] = replace(steps[4], observation=None, motion=None)
+    context = make_context(tmp_path, steps)
+    localize.run(context)
+    poses = context.results(POSES)["poses"].read()
+    assert poses["source"][2] == "inertial"
+    assert poses["source"][4] == "none"
+    assert (poses["x_m"][4], poses["y_m"][4], poses["heading_rad"][4]) == (None, None, None)
+    assert poses["source"][5] == "visual"
+    counters = [shard.counters for shard in context.shards]
+    assert sum(c.get("poses_none", 0) for c in counters) == 1
+    assert sum(sum(c.values()) for c in counters) == 6
+
+
+def test_a_log_without_keyframes_gives_empty_tables(tmp_path: Path) -> None:
+    """All of them there, none with a row."""
+    context = make_context(tmp_path, [])
+    localize.run(context)
+    assert {name: table.rows for name, table in context.results(POSES, SNAPSHOTS, CELLS).items()} == {
+        "poses": 0, "snapshots": 0, "cells": 0,
+    }  # fmt: skip
+
+
+def test_a_motion_that_is_no_number_is_unknown(tmp_path: Path) -> None:
+    """NaN in the odometry must not poison the rest of the track."""
+    steps = walk_steps(5)
+    steps[2] = replace(steps[2], motion=SE2(float("nan"), 0.0, 0.0))
+    context = make_context(tmp_path, steps, "dead_reckoning")
+    localize.run(context)
+    poses = context.results(POSES)["poses"].read()
+    assert [x is None for x in poses["x_m"]] == [False, False, True, False, False]
+
+
+def test_the_unobserved_plane_follows_from_the_others(tmp_path: Path) -> None:
+    """Whether extract stores class 0 or leaves it out, the result is the same."""
+    steps = walk_steps(3)
+    bare = []
+    for step in steps:
+        assert step.observation is not None
+        planes = step.observation.copy()
+        planes[UNOBSERVED] = 0.0
+        bare.append(replace(step, observation=planes))
+    results = []
+    for name, given in (("with", steps), ("without", bare)):
+        context = make_context(tmp_path / name, given)
+        localize.run(context)
+        results.append(every_byte(context.folder))
+    assert results[0] == results[1]
+
+
+def test_a_cell_outside_the_observation_is_refused_by_frame(tmp_path: Path) -> None:
+    """A table that contradicts its own grid is an error with the frame's number, not a crash."""
+    context = make_context(tmp_path, walk_steps(2))
+    rows = {
+        "frame": [0],
+        "stamp_nanos": [0],
+        "cells": [[len(CLASSES) * SIDE * SIDE]],
+        "weights": [[1.0]],
+        "objects": [0],
+    }
+    path = tmp_path / "bad.parquet"
+    write_table(path, OBSERVATIONS, rows, {"classes": list(CLASSES), "cell_m": CELL_M, "side": SIDE})
+    context.tables = {MOTION.name: context.tables["motion"], OBSERVATIONS.name: TableFiles(OBSERVATIONS, [path])}
+    with pytest.raises(SemslamError, match="frame 0"):
+        localize.run(context)
