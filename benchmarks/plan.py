@@ -24,11 +24,11 @@ from pathlib import Path
 
 import semslam
 from semslam.pipeline.config import load_config
+from semslam.pipeline.console import Console, RunView
 from semslam.pipeline.discover import discover
 from semslam.pipeline.executors import SerialExecutor
 from semslam.pipeline.folder import OutputFolder, create_folder
 from semslam.pipeline.runner import Runner
-from semslam.pipeline.console import Console, RunView
 from semslam.stages.catalogue import STAGES
 from semslam.stages.contract import StageContext
 
@@ -96,8 +96,9 @@ def main() -> None:
         decided = seconds(command, times)
         start = seconds([sys.executable, "-c", "pass"], times)
         stats = seconds([sys.executable, "-c", _STAT_ALL, str(root / "watched.txt")], times)
-    print(f"semslam {semslam.__version__}, Python {platform.python_version()}, {platform.machine()}, {os.cpu_count()} CPUs")
-    print(f"{datetime.date.today()}, median of {times}")
+    machine = f"{platform.machine()}, {os.cpu_count()} CPUs"
+    print(f"semslam {semslam.__version__}, Python {platform.python_version()}, {machine}, {datetime.date.today()}")
+    print(f"median of {times}")
     print(f"{number} logs, {len(manifests)} entries, {len(watched)} files that matter")
     print(f"nothing to do         {decided:6.3f} s")
     print(f"python -c pass        {start:6.3f} s   ratio {decided / start:5.1f}")

@@ -1,7 +1,7 @@
 """Four small stages in the shape of the real ones, for testing whatever runs stages.
 
-A log is a text file. Its first line may hold orders: `refuse`, `bug`, `full`, `kill`, `kill-once`, `slow`. Every call of
-a stage appends a line to the file named by SEMSLAM_FAKE_CALLS, from whatever process it runs in.
+A log is a text file. Its first line may hold orders: `refuse`, `bug`, `full`, `kill`, `kill-once`, `warn`, `notes`.
+Every call of a stage appends a line to the file named by SEMSLAM_FAKE_CALLS, from whatever process it runs in.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,7 @@ class FirstConfig:
     """Sleep in every shard, seconds."""
     mode: str = setting("plain", choices=("plain", "fancy"))
     """A word to choose."""
-    names: dict[str, str] = setting({})
+    names: Mapping[str, str] = setting({})
     """Texts by name."""
 
 
@@ -201,7 +201,13 @@ THIRD = Stage(
     variants="kinds",
 )
 LAST = Stage(
-    "last", version=1, config=LastConfig, reads=(TRACKS,), writes=(PICTURES,), entry="tests.fake_stages:last", unit="file"
+    "last",
+    version=1,
+    config=LastConfig,
+    reads=(TRACKS,),
+    writes=(PICTURES,),
+    entry="tests.fake_stages:last",
+    unit="file",
 )
 FAKE_STAGES = (FIRST, SECOND, THIRD, LAST)
 

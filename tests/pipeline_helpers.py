@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from semslam.pipeline.cache import load_manifest
+from semslam.pipeline.cli import run_command
 from semslam.pipeline.config import load_config
 from semslam.pipeline.console import Console, RunView
 from semslam.pipeline.discover import discover
@@ -18,7 +18,7 @@ from semslam.pipeline.folder import create_folder
 from semslam.pipeline.plan import stages_until
 from semslam.pipeline.runner import Runner, RunReport
 from semslam.stages.contract import Stage
-from tests.fake_stages import CALLS, FAKE_STAGES, command_line
+from tests.fake_stages import FAKE_STAGES, command_line
 
 
 class World:
@@ -29,7 +29,6 @@ class World:
         self.logs = root / "logs"
         self.out = root / "out"
         self.calls_file = root / "calls.txt"
-        os.environ[CALLS] = str(self.calls_file)
 
     def run(
         self, *assignments: str, stages: Sequence[Stage] = FAKE_STAGES, until: str = "last", names: Sequence[Any] = ()
@@ -54,6 +53,10 @@ class World:
         return subprocess.Popen(
             command_line(arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=self.root
         )
+
+    def invoke(self, *arguments: Any) -> int:
+        """The command line in this process; its exit code."""
+        return run_command([str(argument) for argument in arguments], FAKE_STAGES)
 
     def command(self, *arguments: Any) -> subprocess.CompletedProcess[str]:
         """The command line in a process of its own, to its end."""

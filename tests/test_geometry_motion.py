@@ -101,11 +101,15 @@ def stop_and_go() -> tuple[Vector, Vector]:
 
 
 def test_straight_stop_and_go() -> None:
-    """From rest to rest the distance is right within a few centimetres, and rest is rest."""
+    """From rest to rest the distance is right within a few centimetres, although up is off by half a degree.
+
+    Uncorrected, that alone would make 38 cm.
+    """
     path, acceleration = stop_and_go()
     still = np.zeros(len(path))
     imu = filled(still, acceleration, still, bias=0.004)
-    steps = [imu.motion(a * SECOND, b * SECOND, TILT[2]) for a, b in ((1, 2), (2, 5), (5, 6))]
+    up = TILT[2] @ rotation_from_vector((0.0, math.radians(0.5), 0.0))
+    steps = [imu.motion(a * SECOND, b * SECOND, up) for a, b in ((1, 2), (2, 5), (5, 6))]
     x = [step.x_m for step in steps if step is not None]
     assert x == pytest.approx([0.0, 0.8, 0.0], abs=0.05)
     assert all(step is not None and abs(step.heading_rad) < math.radians(0.3) for step in steps)

@@ -193,6 +193,9 @@ def test_mixed_pixels_hang_nowhere() -> None:
     assert found[rows[clear], columns[clear] + 2].mean() > 0.9
     assert not found[rows, columns + 1].any()
     assert found.sum() <= 1.1 * len(rows)
+    args = room.points(depth), depth > 0
+    planes = observe(np.zeros((0, *depth.shape), bool), np.zeros(0, int), *args, CLASSES, **GRID)
+    assert planes[OBSTACLE][:, cell(2.3, 0.0)[1] : cell(2.7, 0.0)[1] + 1].sum() == 0.0
 
 
 def test_a_floor_seen_flat_is_no_edge() -> None:
@@ -209,11 +212,9 @@ def test_a_floor_seen_flat_is_no_edge() -> None:
 def test_the_main_body_of_a_mask() -> None:
     """A long table stays whole; what lies beyond a gap is cut off, in front as well as behind."""
     table = np.arange(1.5, 3.5, 0.02).tolist()
-    xs = [0.5] * 5 + table + [4.2] * 9
-    points = flat_scene(xs, [0.0] * len(xs), [0.7] * len(xs))
-    body = main_body(points, np.ones((1, len(xs)), bool))
-    assert body[0].tolist() == [False] * 5 + [True] * len(table) + [False] * 9
-    assert not main_body(points, np.zeros((1, len(xs)), bool)).any()
+    body = main_body(np.array([0.5] * 5 + table + [4.2] * 9, np.float32))
+    assert body.tolist() == [False] * 5 + [True] * len(table) + [False] * 9
+    assert main_body(np.zeros(0, np.float32)).tolist() == []
 
 
 def test_extent_ignores_stray_points() -> None:

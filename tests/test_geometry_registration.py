@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -79,6 +81,9 @@ def test_a_box_hides_the_wall_behind_it(colour: str) -> None:
     edge = 4 * 0.6 / 1.2 * camera.fx  # length of the outline, pixels
     shadow = 0.025 * (1 / 1.2 - 1 / 3) * camera.fx * 0.6 / 1.2 * camera.fx  # wall that the depth camera cannot see
     assert wrong.sum() <= edge * 1.5 * max(1.0, zoom) + 1.2 * shadow
+    for axis in (0, 1):
+        found, expected = (np.flatnonzero(((image > 0) & (image < 2.0)).any(axis=axis)) for image in (seen, wanted))
+        assert np.abs(found[[0, -1]] - expected[[0, -1]]).max() <= math.ceil(zoom)
     middle = seen[seen.shape[0] // 2, seen.shape[1] // 2]
     assert middle == pytest.approx(1.202, abs=1e-4)
     present = seen[seen > 0]
@@ -105,15 +110,26 @@ def test_the_same_camera_changes_nothing() -> None:
 
 
 def test_missing_depth_stays_missing() -> None:
-    """Zeros, negatives and NaN give no surface, and a far hole is not filled."""
+    """Zeros, negatives, NaN and absurd numbers give no surface, and a far hole is not filled."""
     depth = np.full((240, 320), 2.0, np.float32)
     depth[100:140, 100:140] = 0.0
     depth[:10, :10], depth[10:20, :10] = np.nan, -1.0
+    depth[20:30, :10], depth[30:40, :10] = np.inf, 1e30
     seen = register_depth(depth, DEPTH_CAMERA, COLOUR_CAMERAS["same_size"], offset())
-    assert np.isfinite(seen).all()
-    assert (seen >= 0).all()
+    assert np.abs(seen[seen != 0] - 2.002).max() < 1e-4
     assert 0.6 * 40 * 40 < (inner(seen) == 0).sum() < 40 * 40
     assert not register_depth(np.zeros((240, 320), np.float32), DEPTH_CAMERA, DEPTH_CAMERA, offset()).any()
+
+
+def test_a_slanted_plane_keeps_its_shape_up_to_its_rim() -> None:
+    """Next to missing depth the slope comes from the side that is there."""
+    normal, move = np.array([0.6, 0.0, 0.8]), offset()
+    measured = plane_depth(DEPTH_CAMERA, normal, 2.0, np.eye(4)).astype(np.float32)
+    measured[:, 150:170] = measured[100:110] = 0.0
+    seen = inner(register_depth(measured, DEPTH_CAMERA, COLOUR_CAMERAS["same_size"], move))
+    wanted = inner(plane_depth(COLOUR_CAMERAS["same_size"], normal, 2.0, move).astype(np.float32))
+    assert 0.8 < (seen > 0).mean() < 0.95
+    assert np.abs(seen - wanted)[seen > 0].max() < 1e-4
 
 
 def test_a_distorted_depth_camera_is_rectified_first() -> None:

@@ -44,6 +44,8 @@ def test_random_damage_never_lets_a_wrong_message_through(logs: list[Path]) -> N
     print(report(tallies))
     assert [tally.failures for tally in tallies.values()] == [[], [], []]
     assert sum(tally.wrong + tally.crashes + tally.disordered for tally in tallies.values()) == 0
+    for tally in tallies.values():
+        assert tally.whole_shares == pytest.approx([1.0] * len(tally.whole_shares))  # every untouched chunk is read
 
 
 def test_one_flipped_bit_costs_little(logs: list[Path]) -> None:

@@ -157,6 +157,26 @@ def test_only_wanted_channels_are_given_but_all_are_verified(tmp_path: Path) -> 
     assert (reader.losses.messages_read, reader.losses.chunks_skipped) == (10, 1)
 
 
+def test_an_error_in_the_choice_of_channels_is_not_taken_for_damage(tmp_path: Path) -> None:
+    """The caller's own exception reaches the caller."""
+    reader = LogReader([save(tmp_path, log(chunk(channel(1, "/a"), message(1, 1), times=(1, 1))))])
+    with pytest.raises(KeyError, match="/a"):
+        list(reader.messages(lambda each: {"/b": True}[each.topic]))
+
+
+def test_the_report_is_clean_before_and_after_a_sound_log_is_read(tmp_path: Path) -> None:
+    """Messages not read yet are not lost messages."""
+    path = tmp_path / "sound.mcap"
+    writer = Writer(str(path))
+    writer.start()
+    writer.add_message(writer.register_channel("/x", "json", 0), 1, b"{}", 1)
+    writer.finish()  # type: ignore[no-untyped-call]
+    reader = LogReader([path])
+    assert (reader.losses.state, reader.losses.messages_expected, reader.losses.messages_read) == ("ok", 1, 0)
+    assert len(list(reader.messages())) == 1
+    assert (reader.losses.state, reader.losses.messages_missing, reader.losses.messages_read) == ("ok", 0, 1)
+
+
 def test_records_of_equal_content_are_one_channel(tmp_path: Path) -> None:
     """Two ids in one file and a third in its continuation: one object. Another encoding of the topic: another one."""
     first = chunk(schema(1, "S"), schema(2, "S"), channel(1, "/x", 1), channel(2, "/x", 2), channel(3, "/x", 2, "json"))
@@ -499,6 +519,8 @@ def test_an_unchunked_log_goes_on_after_a_broken_record(tmp_path: Path) -> None:
     found, reader = read(save(tmp_path, bytes(data)))
     assert times(found) == [*range(9), *range(11, 20)]
     assert (reader.losses.messages_damaged, reader.losses.state) == (1, "salvaged")
+    found, reader = read(save(tmp_path, bytes(data[: start + 3 * len(messages[0])])))  # cut two messages later
+    assert times(found) == [*range(9), 11, 12]
 
 
 # Attachments, metadata, appendices.
@@ -627,8 +649,9 @@ def test_a_file_that_lost_its_first_bytes_is_still_read(tmp_path: Path) -> None:
     """The first disk block is zeroed, with it MCAP's magic: the chunks behind it are found."""
     definition = channel(1, "/x")
     data = log(chunk(definition, message(1, 1), times=(1, 1)), chunk(definition, message(1, 2), times=(2, 2)))
-    for end in (40, len(data) - 10):
-        found, reader = read(save(tmp_path, bytes(40) + data[40:end] if end > 40 else bytes(40) + data[40:]))
+    headless = bytes(40) + data[40:]
+    for damaged in (headless, headless[:-10]):
+        found, reader = read(save(tmp_path, damaged))
         assert times(found) == [2]
         assert reader.losses.state == "salvaged"
 

@@ -18,7 +18,9 @@ from semslam.slam.registry import NAMES, open_estimator
 from semslam.stages.settings import LocalizeConfig, PaperConfig
 from tests.slam_world import CELL_M, CLASSES, SIDE, make_steps, make_walk, make_world
 
-SMALL = PaperConfig(side=21, headings=90, temperature=0.01)
+SMALL = PaperConfig(
+    side=21, headings=90, temperature=0.01, gate_distance_m=0.6, gate_heading_rad=0.3, leak=0.3, map_side=33
+)
 """A wider view, a sharper field and fewer headings than the paper's: better and faster."""
 
 
@@ -98,8 +100,12 @@ def test_without_any_object_the_motion_decides() -> None:
 
 
 def test_visual_mode_without_any_object_stays_where_it_is() -> None:
-    """Of all equal scores the last pose is nearest; ties never jump to a corner."""
-    estimates = run(opened("paper_visual"), empty_steps(5))
+    """Of all equal scores the last pose is nearest; ties never jump to a corner, and nothing is smeared."""
+    estimator = opened("paper_visual")
+    estimates = run(estimator, empty_steps(5))
+    belief = estimator.belief()
+    assert belief is not None
+    assert belief.planes[FREE_FLOOR].max() > 0.7
     assert [e.map_from_robot for e in estimates[1:]] == [SE2(pytest.approx(0.0), pytest.approx(0.0), 0.0)] * 4
 
 
@@ -163,7 +169,7 @@ def test_dead_reckoning_composes_and_holds() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("cut", [0, 1, 4, 7])
+@pytest.mark.parametrize("cut", [0, 4, 7])
 def test_a_restored_estimator_goes_on_bit_for_bit(name: str, cut: int) -> None:
     """Whatever it was doing: before the start, after it, lost, or in the middle."""
     steps = make_steps(make_world(), make_walk(9), noise_m=0.02)

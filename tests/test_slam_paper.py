@@ -250,6 +250,15 @@ def test_placing_equals_the_sum_over_everything(window: paper.Window, density: f
     np.testing.assert_allclose(placed, slow_placing(rotated, field)[:, window[0], window[1]], atol=1e-6)
 
 
+def test_a_pose_off_the_map_places_nothing() -> None:
+    """The region of interest may still reach the map."""
+    pose = SE2(1.6, 0.0, 0.0)
+    window = paper.roi_mask(pose, GRID, 5)
+    placed = paper.place_observation(random_planes((8, 4, 5, 5)), paper.pose_field(pose, GRID), window)
+    assert placed.shape == (4, 5, 2)
+    assert not placed.any()
+
+
 def test_placing_equals_onnx_runtime_at_full_size() -> None:
     """A transposed convolution is the correlation with the flipped kernels."""
     rotated = paper.rotate_observation(random_planes((4, 11, 11), 9), 36)

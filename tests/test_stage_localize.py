@@ -21,7 +21,8 @@ from semslam.tables.parquet import TableFiles, write_table
 from semslam.tables.spec import CELLS, MOTION, OBSERVATIONS, POSES, SNAPSHOTS
 from tests.slam_world import CELL_M, CLASSES, SIDE, MemoryContext, make_steps, make_walk, make_world, write_inputs
 
-CONFIG = LocalizeConfig(paper=PaperConfig(headings=36, temperature=0.01), shard_frames=4, snapshot_every=3)
+PAPER = PaperConfig(headings=36, temperature=0.01, gate_distance_m=0.6, gate_heading_rad=0.3)
+CONFIG = LocalizeConfig(paper=PAPER, shard_frames=4, snapshot_every=3)
 NAMES = ["paper", "paper_visual", "dead_reckoning"]
 
 
@@ -112,7 +113,7 @@ def test_snapshots_are_the_estimators_own_map(tmp_path: Path) -> None:
         assert planes[1:, row, column + 3].any()  # just ahead of the start
 
 
-class Killed(Exception):
+class KilledError(Exception):
     """Stands for the end of the process."""
 
 
@@ -126,13 +127,13 @@ def test_a_cut_run_goes_on_with_the_same_bytes(tmp_path: Path, variant: str, cut
     localize.run(straight)
     resumed = make_context(tmp_path / "resumed", steps, variant)
 
-    def die(done: int, total: int | None = None) -> None:
+    def die(done: int, _total: int | None = None) -> None:
         if done > cut * CONFIG.shard_frames:
-            raise Killed
+            raise KilledError
 
     dying = replace(resumed)
-    dying.progress = die  # type: ignore[method-assign]
-    with pytest.raises(Killed):
+    dying.progress = die  # type: ignore[method-assign, assignment]
+    with pytest.raises(KilledError):
         localize.run(dying)
     for leftover in (resumed.folder / f"shard-{cut}").iterdir():
         leftover.unlink()
@@ -169,6 +170,17 @@ def test_keyframes_without_observation_or_motion(tmp_path: Path) -> None:
     counters = [shard.counters for shard in context.shards]
     assert sum(c.get("poses_none", 0) for c in counters) == 1
     assert sum(sum(c.values()) for c in counters) == 6
+
+
+def test_leaving_the_map_of_the_estimator_is_said(tmp_path: Path) -> None:
+    """The grid of the paper has a border; the message says how to move it."""
+    config = replace(CONFIG, paper=replace(CONFIG.paper, map_side=9), shard_frames=100)
+    walk = [SE2(0.4 * i, 0.0, 0.0) for i in range(6)]  # the border is at 1.35 m
+    context = make_context(tmp_path, make_steps(make_world(objects=0), walk), config=config)
+    localize.run(context)
+    (warning,) = context.shards[0].warnings
+    assert warning.startswith("2 keyframes lie outside the map of `paper`, 2.7 m wide")
+    assert "`localize.paper.map_side`" in warning
 
 
 def test_a_log_without_keyframes_gives_empty_tables(tmp_path: Path) -> None:

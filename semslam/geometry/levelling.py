@@ -5,8 +5,8 @@ mean over a window is only the change of velocity divided by the window's length
 into one body orientation by the gyro, average it away. A window that reaches as far ahead as back cancels a constant
 gyro bias as well, to first order.
 
-Measured on a hand-held camera walking around a kitchen (100 Hz, mean of 100 stamps): mean tilt error 0.50 degrees and
-largest 1.1 with a window of 4 s, 0.73 and 1.7 with 2 s, 0.35 and 0.7 with 8 s.
+Measured on a camera carried around a kitchen (100 samples a second, 100 stamps): mean tilt error 0.50 degrees and
+largest 1.1 with a window of 4 s, 0.69 and 1.7 with 2 s, 0.35 and 0.7 with 8 s.
 """
 
 from __future__ import annotations
@@ -295,6 +295,9 @@ class FloorTrack(NamedTuple):
 @dataclass
 class FloorTracker:
     """Camera height over time: follows slow change, refuses the jump of a counter top, corrects a wrong start.
+
+    Measured on a camera carried around a kitchen, where it rises and sinks by 0.3 m and sees no floor in a third of the
+    pictures: within 5 cm (one sigma) of the true height at three pictures a second, 7 cm at one.
 
     A plane lower than the believed floor is soon trusted, since there is nothing below a floor (but for reflections); a
     higher one must stay long, since a table fills the view every now and then.

@@ -97,10 +97,10 @@ def observe(
     object_pixels = np.zeros(side * side, np.int64)
     background = usable.copy()
     for mask, class_id in zip(masks, class_ids, strict=True):
-        body = main_body(points, mask & usable)
-        background &= ~body
-        hits = _count(cells[body], side)
-        planes[class_id] += (hits / max(1, int(np.count_nonzero(body)))).astype(np.float32)
+        body = _body_pixels(mask & usable, points)
+        background.ravel()[body] = False
+        hits = _count(cells.ravel()[body], side)
+        planes[class_id] += (hits / max(1, len(body))).astype(np.float32)
         object_pixels += hits
     np.minimum(planes, np.float32(1.0), out=planes)
     height = points[..., 2]
@@ -128,6 +128,13 @@ def _count(cells: NDArray[np.int32], side: int) -> NDArray[np.int64]:
     return np.bincount(cells, minlength=side * side + 1)[:-1]
 
 
+def _body_pixels(mask: NDArray[np.bool_], points: Points) -> NDArray[np.int64]:
+    """Flat indices of the pixels of a mask (H, W) that belong to its main body."""
+    pixels = np.flatnonzero(mask)
+    ground = points.reshape(-1, 3)[pixels, :2]
+    return pixels[main_body(np.hypot(ground[:, 0], ground[:, 1]))]
+
+
 def flying(points: Points, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Pixels (H, W) that hang between two surfaces: far from both neighbours in their row, or in their column.
 
@@ -144,24 +151,21 @@ def flying(points: Points, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return alone & valid
 
 
-def main_body(points: Points, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The part (H, W) of a mask in the stretch of ranges that holds most of its pixels; stretches end at gaps.
+def main_body(ranges_m: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which pixels (n,) of a mask belong to the stretch of ranges that holds most of them; stretches end at gaps.
 
-    The range is the distance from the robot's origin along the ground.
+    The range of a pixel is the distance from the robot's origin along the ground.
     """
-    ranges = np.hypot(points[..., 0][mask], points[..., 1][mask])
-    if ranges.size == 0:
-        return mask
-    bins = (ranges / np.float32(RANGE_BIN_M)).astype(np.int64)
+    if ranges_m.size == 0:
+        return np.zeros(0, bool)
+    bins = (ranges_m / np.float32(RANGE_BIN_M)).astype(np.int64)
     counts = np.bincount(bins)
     filled = np.flatnonzero(counts >= max(1.0, RANGE_EMPTY_SHARE * float(counts.max())))
     starts = np.concatenate([[0], np.flatnonzero(np.diff(filled) > RANGE_GAP_BINS) + 1])
     most = int(np.argmax(np.add.reduceat(counts[filled], starts)))
     low = filled[starts[most]]
     high = filled[starts[most + 1] - 1] if most + 1 < len(starts) else filled[-1]
-    body = np.zeros_like(mask)
-    body[mask] = (bins >= low) & (bins <= high)
-    return body
+    return np.asarray((bins >= low) & (bins <= high))
 
 
 def extent(points: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:

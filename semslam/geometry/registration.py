@@ -23,6 +23,9 @@ Depth = NDArray[np.float32]
 MAX_SLOPE = 0.03
 """Inverse depth that changes by a larger share from pixel to pixel is an edge, not a slanted surface."""
 
+FARTHEST_M = 10_000.0
+"""No sensor measures this; a damaged image may say so."""
+
 _STEPS_PER_M = 4096.0  # depth resolution of the z-buffer, 0.24 mm
 _EMPTY = 1e300
 
@@ -36,7 +39,7 @@ def register_depth(
     belongs to `colour_camera.rectified()`. With the same rectified camera and no offset the input returns unchanged.
     Foreground spreads over background by up to one pixel of the coarser image.
     """
-    depth = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0).astype(np.float32)
+    depth = np.where((depth_m > 0) & (depth_m < FARTHEST_M), depth_m, 0).astype(np.float32)
     depth = np.asarray(depth_camera.rectify(depth, cv2.INTER_NEAREST), np.float32)
     source, target = depth_camera.rectified(), colour_camera.rectified()
     if source == target and np.array_equal(colour_from_depth, np.eye(4)):
@@ -90,23 +93,26 @@ def _depth_on_rays(
     A plane n . X = 1 of the source camera has inverse depth n . ray on a source ray, so n follows from inverse depth
     and its two slopes. X' = R X + t turns it into (R n) . X' = 1 + (R n) . t.
     """
-    found = winners >= 0
-    index = winners[found]
-    inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
-    slope_u, slope_v = _slope(inverse, axis=1).ravel()[index], _slope(inverse, axis=0).ravel()[index]
-    row, column = np.divmod(index, source.width)
-    level = inverse.ravel()[index]
-    level = level - slope_u * (column - source.cx).astype(np.float32) - slope_v * (row - source.cy).astype(np.float32)
-    normal = np.stack([slope_u * np.float32(source.fx), slope_v * np.float32(source.fy), level])  # (3, n)
-    turned = target_from_source[:3, :3].astype(np.float32) @ normal
-    scale = 1 + target_from_source[:3, 3].astype(np.float32) @ turned
-    place_row, place_column = np.nonzero(found)
-    ray_x = ((np.arange(target.width) - target.cx) / target.fx).astype(np.float32)[place_column]
-    ray_y = ((np.arange(target.height) - target.cy) / target.fy).astype(np.float32)[place_row]
+    slope_u, slope_v, level = _planes(depth, source)
+    rotation, offset = target_from_source[:3, :3].astype(np.float32), target_from_source[:3, 3].astype(np.float32)
+    index = np.maximum(winners, 0)
+    normal = np.stack([plane.ravel()[index].ravel() for plane in (slope_u, slope_v, level)])  # (3, H' W')
+    turned = (rotation @ normal).reshape(3, *winners.shape)
+    scale = 1 + np.einsum("i,ihw->hw", offset, turned)
+    ray_x = ((np.arange(target.width) - target.cx) / target.fx).astype(np.float32)
+    ray_y = ((np.arange(target.height) - target.cy) / target.fy).astype(np.float32)[:, None]
     facing = turned[0] * ray_x + turned[1] * ray_y + turned[2]
-    seen = np.zeros(winners.shape, np.float32)
-    seen[found] = np.where((facing > 1e-4) & (scale > 0), scale / np.maximum(facing, np.float32(1e-4)), 0)
-    return seen
+    seen = (winners >= 0) & (facing > 1e-4) & (scale > 0)
+    return np.asarray(np.divide(scale, facing, out=np.zeros(winners.shape, np.float32), where=seen))
+
+
+def _planes(depth: Depth, source: Camera) -> tuple[Depth, Depth, Depth]:
+    """The plane n of every source pixel, n . ray = inverse depth: the three components of n, each (H, W)."""
+    inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
+    across, down = _slope(inverse, axis=1) * np.float32(source.fx), _slope(inverse, axis=0) * np.float32(source.fy)
+    ray_x = ((np.arange(source.width) - source.cx) / source.fx).astype(np.float32)
+    ray_y = ((np.arange(source.height) - source.cy) / source.fy).astype(np.float32)[:, None]
+    return across, down, inverse - across * ray_x - down * ray_y
 
 
 def _slope(inverse: Depth, axis: int) -> Depth:

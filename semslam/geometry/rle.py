@@ -35,8 +35,3 @@ def decode(runs: Sequence[int] | NDArray[np.uint32], height: int, width: int) ->
         raise SemslamError(f"Mask runs add up to {total} pixels, the image has {width} x {height} = {width * height}")
     values = np.arange(lengths.size) % 2 == 1
     return np.repeat(values, lengths).reshape(height, width)
-
-
-def area(runs: Sequence[int] | NDArray[np.uint32]) -> int:
-    """Foreground pixels of an encoded mask, without decoding it."""
-    return int(np.asarray(runs, np.int64)[1::2].sum())

@@ -88,7 +88,7 @@ class Rows:
 
 
 def read_body(handle: BinaryIO, block: Block) -> tuple[bytes, bool]:
-    """(records of the block, whether a checksum of their own covers them). Raises DamagedRecordError, codec errors."""
+    """(records of the block, whether a checksum of their own covers them). Raises DamagedRecordError."""
     if block.head is None:
         return read_exactly(handle, block.offset, block.length), False
     head = block.head
@@ -126,16 +126,17 @@ def check_size(head: ChunkHead) -> None:
 
 
 def decompress(data: bytes, head: ChunkHead) -> bytes:
-    """The records of a chunk: exactly as many bytes as its head claims, never more in memory. Raises on any doubt."""
-    check_size(head)
-    if head.compression == "zstd":
-        body = _from_zstd(data, head.size)
-    elif head.compression == "lz4":
-        body = _from_lz4(data, head.size)
-    elif head.compression == "":
-        body = data
-    else:
+    """The records of a chunk: exactly as many bytes as its head claims, never more in memory.
+
+    Raises DamagedRecordError on any doubt.
+    """
+    codec = _CODECS.get(head.compression)
+    if codec is None:
         raise DamagedRecordError(f"unknown compression `{head.compression}`")
+    try:
+        body = codec(data, head.size)
+    except Exception as error:  # zstandard raises ZstdError, lz4 RuntimeError, either MemoryError or OverflowError
+        raise DamagedRecordError(f"{head.compression} cannot be decompressed: {error}") from error
     if len(body) != head.size:
         raise DamagedRecordError(f"claims {head.size:,} bytes, holds {len(body):,}")
     return body
@@ -154,6 +155,13 @@ def _from_lz4(data: bytes, size: int) -> bytes:
     if not decompressor.eof:
         raise DamagedRecordError("its lz4 frame does not end where it should")
     return body
+
+
+_CODECS: dict[str, Callable[[bytes, int], bytes]] = {
+    "": lambda data, _: data,
+    "zstd": _from_zstd,
+    "lz4": _from_lz4,
+}
 
 
 def frames(body: bytes) -> Iterator[tuple[int, int, int]]:
@@ -223,8 +231,10 @@ def parse_rows(body: bytes, definitions: Definitions, trusted: bool, wanted: Cal
     while position < end:
         if end - position >= MESSAGE_HEAD_BYTES:
             opcode, length, channel_id, sequence, log_time, publish_time = MESSAGE_HEAD.unpack_from(body, position)
-        else:
+        elif end - position >= HEAD_BYTES:
             opcode, length = HEAD.unpack_from(body, position)
+        else:
+            raise DamagedRecordError(f"{end - position} stray bytes after the last record")
         start = position + HEAD_BYTES
         following = start + length
         if following > end or opcode == 0:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from mcap.opcode import Opcode
 
-from semslam.errors import SemslamError
 from semslam.logs.channels import Channel, ChannelPool, Definitions, Scope
 from semslam.logs.chunks import MAX_CHUNK_BYTES, Block, Rows, parse_rows, read_body
 from semslam.logs.losses import FileLosses
@@ -59,10 +58,9 @@ class FileIndex:
     def open_block(self, block: Block, wanted: Callable[[Channel], bool], losses: FileLosses) -> Rows | None:
         """The wanted messages of a block; None, and the loss counted, where the block cannot be believed."""
         try:
-            rows, checked = self._read(block, wanted)
-        except SemslamError:
-            raise
-        except Exception as error:  # lz4 raises RuntimeError, zstandard its own, damaged text UnicodeDecodeError, ...
+            body, checked = self._read(block)
+            rows = parse_rows(body, self.definitions, checked, wanted)
+        except DamagedRecordError as error:
             _count_loss(block, losses, error)
             return None
         losses.chunks_read += block.head is not None
@@ -71,13 +69,13 @@ class FileIndex:
         losses.messages_unverified += 0 if checked else rows.count - rows.unknown
         return rows
 
-    def _read(self, block: Block, wanted: Callable[[Channel], bool]) -> tuple[Rows, bool]:
+    def _read(self, block: Block) -> tuple[bytes, bool]:
+        """(records, whether a checksum covers them). DamagedRecordError for whatever is wrong with them."""
         with self.source.open() as handle:
             body, checked = read_body(handle, block)
         if not checked and self.data_holds is False:
             raise DamagedRecordError("no checksum of its own, and that of the data section fails")
-        checked = checked or bool(self.data_holds)
-        return parse_rows(body, self.definitions, checked, wanted), checked
+        return body, checked or bool(self.data_holds)
 
     def channel_counts(self) -> dict[Channel, int | None]:
         """Every channel described in the file; None where a sound index came without counts."""
@@ -139,9 +137,8 @@ def open_index(path: Path, pool: ChannelPool) -> FileIndex:
 
 def _start(source: Source, definitions: Definitions, losses: FileLosses, finished: bool) -> int:
     """Where the first record stands, or 0 where the file has lost its first bytes."""
-    with source.open() as handle:
-        if handle.read(len(MAGIC)) == MAGIC:
-            return len(MAGIC)
+    if source.head(len(MAGIC)) == MAGIC:
+        return len(MAGIC)
     if not finished and not looks_like_mcap(source, definitions):
         raise not_an_mcap_file(source)
     losses.note("does not start as an MCAP file does")

@@ -24,6 +24,8 @@ class FileLosses:
     """Messages found sound, of all channels, wanted or not."""
     messages_expected: int | None = None
     """Messages the writer counted; None where no sound summary says so."""
+    messages_missing: int = 0
+    """Expected less read, known once the file has been read to its end."""
     messages_unverified: int = 0
     """Part of `messages_read` that no checksum covers: the writer stored none."""
     messages_unknown_channel: int = 0
@@ -45,9 +47,10 @@ class FileLosses:
     @property
     def state(self) -> str:
         """`ok`, or `salvaged` when anything at all is missing."""
-        missing = self.messages_expected is not None and self.messages_read < self.messages_expected
-        counts = (self.messages_unknown_channel, self.messages_damaged, self.chunks_skipped, self.bytes_skipped)
-        return "salvaged" if self.truncated or self.summary_damaged or missing or any(counts) else "ok"
+        messages = self.messages_missing + self.messages_unknown_channel + self.messages_damaged
+        bytes_or_chunks = self.bytes_skipped + self.chunks_skipped
+        damaged = self.truncated or self.summary_damaged or messages or bytes_or_chunks
+        return "salvaged" if damaged else "ok"
 
     def note(self, problem: str) -> None:
         """Keep a sentence, up to a bound: a log damaged in a million places must not fill the manifest."""
@@ -94,6 +97,10 @@ class LossReport:
         return None if None in counts else sum(count for count in counts if count is not None)
 
     @property
+    def messages_missing(self) -> int:
+        return sum(file.messages_missing for file in self.files)
+
+    @property
     def messages_unverified(self) -> int:
         return sum(file.messages_unverified for file in self.files)
 
@@ -136,6 +143,7 @@ _TOTALS = (
     "truncated",
     "messages_read",
     "messages_expected",
+    "messages_missing",
     "messages_unverified",
     "messages_unknown_channel",
     "messages_damaged",

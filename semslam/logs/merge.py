@@ -47,6 +47,8 @@ class FileReading:
 
     def finish(self) -> None:
         """Compare what was read with what the writer counted."""
+        if self.losses.messages_expected is not None:
+            self.losses.messages_missing = max(0, self.losses.messages_expected - self.losses.messages_read)
         summary = self.index.summary
         expected = summary.statistics.channel_message_counts if summary and summary.statistics else {}
         for channel_id, count in sorted(expected.items()):

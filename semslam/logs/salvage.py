@@ -10,8 +10,9 @@ before a broken place (its length may be what broke).
 
 from __future__ import annotations
 
+import heapq
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import BinaryIO
 
@@ -48,11 +49,12 @@ _CHAIN = 3
 _MAX_GROWTH_BYTES = 1024
 """Bytes that later versions of the format may add to a record. More than that is a damaged length."""
 
-_CHUNK_START = rb"(?=\x06.{5}\0\0\0.{28}(?:\x04\0\0\0zstd|\x03\0\0\0lz4|\0\0\0\0))"  # stored size below 2^40 bytes
-_DATA_END = rb"(?=\x0f\x04\0\0\0\0\0\0\0)"
-_MESSAGE_START = rb"(?=\x05.{4}\0\0\0\0)"  # size below 2^32 bytes
-_LANDMARKS = re.compile(_CHUNK_START + b"|" + _DATA_END, re.DOTALL)
-_LANDMARKS_WITHOUT_CHUNKS = re.compile(b"|".join((_CHUNK_START, _DATA_END, _MESSAGE_START)), re.DOTALL)
+# One pattern each, led by its opcode: so they are searched at memory speed, a hundred times faster than as one. The
+# zeros are the upper bytes of the length: chunks below 2^40 bytes, messages below 2^32.
+_CHUNK_START = re.compile(rb"\x06(?=.{5}\0\0\0.{28}(?:\x04\0\0\0zstd|\x03\0\0\0lz4|\0\0\0\0))", re.DOTALL)
+_MESSAGE_START = re.compile(rb"\x05(?=.{4}\0\0\0\0)", re.DOTALL)
+_DATA_END = re.compile(rb"\x0f\x04\0\0\0\0\0\0\0")
+_LANDMARKS = (_CHUNK_START, _DATA_END)
 _LANDMARK_BYTES = HEAD_BYTES + 28 + 8
 
 _DEFINITIONS = frozenset((Opcode.SCHEMA, Opcode.CHANNEL))
@@ -228,7 +230,7 @@ class Walk:
         block = Block(position, head.length, head.start_nanos, head.end_nanos, head)
         try:
             rows = _verify(handle, block, self._definitions)
-        except Exception as error:  # lz4 raises RuntimeError, zstandard its own, damaged text UnicodeDecodeError, ...
+        except DamagedRecordError as error:
             if position + head.length < end:
                 _head_at(handle, position + head.length, end)
             self._losses.chunks_skipped += 1
@@ -284,7 +286,7 @@ class Walk:
 
     def _resume(self, handle: BinaryIO, position: int, end: int, error: DamagedRecordError) -> int:
         """Account for what is broken at `position` and return where to go on, `end` if nowhere."""
-        found = self._next_landmark(handle, position + 1, end)
+        found = self.next_landmark(handle, position + 1, end)
         cut = isinstance(error, CutRecordError) and end == self._source.size and found is None
         if cut:
             self._release_held()
@@ -296,19 +298,20 @@ class Walk:
         self._losses.skip(going_on - position, f"{going_on - position:,} bytes at byte {position:,} skipped: {error}")
         return going_on
 
-    def _next_landmark(self, handle: BinaryIO, start: int, end: int) -> int | None:
+    def next_landmark(self, handle: BinaryIO, start: int, end: int) -> int | None:
+        """The next offset in [start, end) from which the walk can go on; None where there is none."""
         without_chunks = self._bare_messages > 0 and self._chunks == 0
-        pattern = _LANDMARKS_WITHOUT_CHUNKS if without_chunks else _LANDMARKS
-        for candidate in _matches(handle, pattern, start, end):
+        patterns = (*_LANDMARKS, _MESSAGE_START) if without_chunks else _LANDMARKS
+        for candidate in _matches(handle, patterns, start, end):
             try:
                 if self._is_sound(handle, candidate, end):
                     return candidate
-            except Exception:  # whatever parsers and codecs make of random bytes: they were no landmark
+            except DamagedRecordError:
                 continue
         return None
 
     def _is_sound(self, handle: BinaryIO, position: int, end: int) -> bool:
-        """Whether a record that must be true stands here. May raise anything for bytes that are not one."""
+        """Whether a record that must be true stands here; False, or DamagedRecordError, for other bytes."""
         opcode, length = _head_at(handle, position, end)
         following = position + HEAD_BYTES + length
         if opcode == Opcode.DATA_END:
@@ -321,7 +324,9 @@ class Walk:
 
     def _is_chain(self, handle: BinaryIO, position: int, end: int) -> bool:
         """Whether messages of known channels stand here one behind the other, up to the end or `_CHAIN` of them."""
-        for _ in range(_CHAIN):
+        for link in range(_CHAIN):
+            if link and position == end:
+                return True
             opcode, length = _head_at(handle, position, end)
             if opcode == Opcode.DATA_END and length == 4:
                 return True
@@ -337,7 +342,7 @@ def looks_like_mcap(source: Source, definitions: Definitions, search_bytes: int 
     """Whether a file without MCAP's first bytes holds a sound chunk near its beginning all the same."""
     walk = Walk(source, definitions, FileLosses(source.path.name), take_summary=False)
     with source.open() as handle:
-        return walk._next_landmark(handle, 0, min(source.size, search_bytes)) is not None
+        return walk.next_landmark(handle, 0, min(source.size, search_bytes)) is not None
 
 
 def _head_at(handle: BinaryIO, position: int, end: int) -> tuple[int, int]:
@@ -384,19 +389,23 @@ def _verify(handle: BinaryIO, block: Block, definitions: Definitions) -> Rows:
     return parse_rows(body, definitions, checked, wanted=lambda _: False)
 
 
-def _matches(handle: BinaryIO, pattern: re.Pattern[bytes], start: int, end: int) -> Iterator[int]:
-    """Offsets in [start, end) at which `pattern` matches, ascending, reading a window at a time."""
+def _matches(handle: BinaryIO, patterns: Sequence[re.Pattern[bytes]], start: int, end: int) -> Iterator[int]:
+    """Offsets in [start, end) at which one of the patterns matches, ascending, reading a window at a time."""
     while start < end:
         window = _window(handle, start, min(_WINDOW_BYTES, end - start))
         last = start + len(window) >= end
         reach = len(window) if last else len(window) - _LANDMARK_BYTES
-        for match in pattern.finditer(window):
-            if match.start() >= reach:
+        for at in heapq.merge(*(_starts(pattern, window) for pattern in patterns)):
+            if at >= reach:
                 break
-            yield start + match.start()
+            yield start + at
         if last:
             return
         start += reach
+
+
+def _starts(pattern: re.Pattern[bytes], window: bytes) -> Iterator[int]:
+    return (match.start() for match in pattern.finditer(window))
 
 
 def _window(handle: BinaryIO, start: int, length: int) -> bytes:

@@ -41,6 +41,14 @@ class Source:
         with handle:
             yield handle
 
+    def head(self, length: int) -> bytes:
+        """The first `length` bytes, or all of a shorter file; nothing where the disk cannot read them."""
+        try:
+            with self.open() as handle:
+                return read_exactly(handle, 0, min(length, self.size))
+        except DamagedRecordError:
+            return b""
+
     def checksum(self, end: int) -> int:
         """CRC-32 of the bytes [0, end)."""
         crc = 0
@@ -86,8 +94,7 @@ def open_source(path: Path) -> Source:
 
 def not_an_mcap_file(source: Source) -> SemslamError:
     """The error for a file in which nothing looks like MCAP, naming what it is instead where that is plain to see."""
-    with source.open() as handle:
-        head = handle.read(32)
+    head = source.head(32)
     for prefix, what, hint in _OTHER_FORMATS:
         if head.startswith(prefix):
             hint = hint.format(name=source.path.name, stem=source.path.name.split(".")[0])

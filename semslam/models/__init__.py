@@ -1,1 +1,1 @@
-"""Networks at run time: ONNX Runtime sessions, and adapters from their outputs to boxes and masks. No torch here."""
+"""Networks: ONNX Runtime sessions, detectors and segmenters behind adapters. No torch at run time."""

@@ -34,7 +34,11 @@ def names_from_file(path: Path) -> list[str]:
 
 
 def names_from_metadata(metadata: Mapping[str, str]) -> list[str] | None:
-    """Names in a model's metadata, as JSON, a Python literal or a comma-separated list; None if there are none."""
+    """Names in a model's metadata, as JSON, a Python literal or a comma-separated list; None if there are none.
+
+    Raises:
+        SemslamError: names by number leave numbers out.
+    """
     for key in _KEYS:
         if metadata.get(key, "").strip():
             names = _parsed(metadata[key].strip())
@@ -52,10 +56,20 @@ def _parsed(text: str) -> list[str]:
         except (ValueError, SyntaxError, MemoryError, RecursionError):
             continue
     if isinstance(value, dict):
-        try:
-            return [str(value[key]) for key in sorted(value, key=int)]
-        except (TypeError, ValueError):
-            return []
+        return _by_number(value)
     if isinstance(value, list | tuple):
         return [str(name) for name in value]
     return [part.strip() for part in text.split(",") if part.strip()] if "," in text and "{" not in text else []
+
+
+def _by_number(names: Mapping[Any, Any]) -> list[str]:
+    try:
+        numbered = {int(key): str(name) for key, name in names.items()}
+    except (TypeError, ValueError):
+        return []
+    if sorted(numbered) != list(range(len(names))):
+        raise SemslamError(
+            f"The model's metadata names classes {', '.join(map(str, sorted(numbered)[:8]))} and leaves others out",
+            hint="give all names with `--classes FILE.txt`",
+        )
+    return [numbered[number] for number in range(len(names))]

@@ -8,7 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semslam.errors import SemslamError
+
 Floats = NDArray[np.float32]
+
+_MAX_SCORE = 1.001
+"""Rounding may carry a probability a little beyond 1."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +81,17 @@ def select(
         box: how the picture was fitted.
         min_score: lower ones are no candidates.
         max_overlap: 0 to 1.
+
+    Raises:
+        SemslamError: scores are no probabilities.
     """
     good = np.isfinite(scores) & np.isfinite(boxes).all(axis=1)
     dropped = int(np.count_nonzero(~good))
+    if np.any(scores[good] > _MAX_SCORE):
+        raise SemslamError(
+            f"Detector gives scores up to {float(scores[good].max()):.1f}, which are no probabilities",
+            hint="it is not of the layout it is taken for: name that with `--set extract.adapter=NAME`",
+        )
     good &= scores >= min_score
     boxes, scores, class_ids = boxes[good], scores[good], class_ids[good]
     limits = np.array([box.width, box.height, box.width, box.height], np.float32)

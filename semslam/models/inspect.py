@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from semslam.models.class_names import names_from_metadata
-from semslam.models.detectors import matching
+from semslam.models.detectors import matching, with_known_sizes
+from semslam.models.onnxfile import file_digest
 from semslam.models.session import Signature, open_session
 
 
@@ -22,6 +22,8 @@ class ModelDescription:
     bytes: int
     producer: str
     provider: str
+    opset: str
+    """Operator sets by domain."""
     signature: Signature
     adapter: str
     """Name of the detector adapter that fits; empty if none does."""
@@ -39,7 +41,7 @@ class ModelDescription:
     def text(self) -> str:
         """For a terminal."""
         lines = [f"{self.path}   {self.bytes:,} bytes, sha256 {self.sha256[:16]}...", self.signature.text()]
-        lines += [f"  producer {self.producer or '-'}, runs on {self.provider}", ""]
+        lines += [f"  {self.opset}, producer {self.producer or '-'}, runs on {self.provider}", ""]
         if self.adapter:
             lines.append(f"detector: adapter {self.adapter}, {self.classes} classes")
             lines.append(
@@ -60,17 +62,18 @@ def describe(path: Path) -> ModelDescription:
         SemslamError: the file is no usable model.
     """
     session = open_session(path)
-    adapter, reasons = matching(session.signature)
-    data = path.read_bytes()
+    signature = with_known_sizes(session)
+    adapter, reasons = matching(signature)
     return ModelDescription(
         path=str(path),
-        sha256=hashlib.sha256(data).hexdigest(),
-        bytes=len(data),
+        sha256=file_digest(path),
+        bytes=path.stat().st_size,
+        opset=", ".join(f"{domain} {version}" for domain, version in session.signature.opsets),
         producer=session.signature.producer,
         provider=session.provider,
         signature=session.signature,
         adapter=adapter.name if adapter else "",
-        classes=adapter.classes(session.signature) if adapter else None,
+        classes=adapter.classes(signature) if adapter else None,
         class_names=tuple(names_from_metadata(session.signature.metadata) or ()),
         reasons=reasons,
     )

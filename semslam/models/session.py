@@ -13,12 +13,14 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from semslam.errors import SemslamError
+from semslam.models.onnxfile import read_onnx
 
 PROVIDER_VARIABLE = "SEMSLAM_PROVIDER"
 """Environment variable that names the execution provider, such as CUDAExecutionProvider."""
-PREFERRED_PROVIDERS = ("CUDAExecutionProvider", "CoreMLExecutionProvider", "CPUExecutionProvider")
+PREFERRED_PROVIDERS = ("CUDAExecutionProvider", "CPUExecutionProvider")
 """Taken in this order, from what the installed onnxruntime has."""
 _FATAL_ONLY = 4
+_HALF = {"tensor(float16)": np.float16}
 
 Array = NDArray[Any]
 
@@ -44,6 +46,10 @@ class Signature:
     outputs: tuple[Tensor, ...]
     metadata: Mapping[str, str]
     producer: str
+    opsets: tuple[tuple[str, int], ...] = ()
+    """Operator sets by domain."""
+    operators: tuple[str, ...] | None = None
+    """Operator types in the graph; None if they are not to be looked at."""
 
     def text(self) -> str:
         """Inputs and outputs, one a line."""
@@ -67,8 +73,12 @@ class Session:
         Raises:
             SemslamError: the model fails on this input.
         """
+        kinds = {tensor.name: _HALF.get(tensor.type) for tensor in self.signature.inputs}
+        cast = {
+            name: value.astype(kinds[name], copy=False) if kinds.get(name) else value for name, value in feeds.items()
+        }
         try:
-            outputs: list[Array] = self._ort.run(None, dict(feeds))
+            outputs: list[Array] = self._ort.run(None, cast)
         except Exception as error:  # onnxruntime throws a dozen types without a common base
             shapes = ", ".join(f"{name} {list(value.shape)}" for name, value in feeds.items())
             raise SemslamError(f"Model `{self.path}` fails on input {shapes}: {_first_line(error)}") from error
@@ -86,21 +96,27 @@ def open_session(path: Path, *, threads: int = 1, what: str = "model") -> Sessio
     Raises:
         SemslamError: no such file, no ONNX model, one this onnxruntime cannot run, or an unknown provider.
     """
-    if not path.is_file():
-        raise SemslamError(f"No {what} file `{path}`", hint="give the path of an ONNX file")
+    facts = read_onnx(path, what)
     provider = _provider()
     try:
         session = ort.InferenceSession(str(path), _options(threads), providers=[provider])
     except Exception as error:  # onnxruntime throws a dozen types without a common base
         raise _unreadable(path, what, error) from error
-    meta = session.get_modelmeta()
     signature = Signature(
-        _tensors(session.get_inputs()),
-        _tensors(session.get_outputs()),
-        dict(meta.custom_metadata_map),
-        meta.producer_name,
+        inputs=_tensors(session.get_inputs()),
+        outputs=_tensors(session.get_outputs()),
+        metadata=dict(session.get_modelmeta().custom_metadata_map),
+        producer=facts.producer,
+        opsets=facts.opsets,
+        operators=facts.operators,
     )
-    return Session(path, signature, session.get_providers()[0], session)
+    used = session.get_providers()[0]
+    if os.environ.get(PROVIDER_VARIABLE) and used != provider:
+        raise SemslamError(
+            f"Execution provider `{provider}` cannot run {what} `{path}` on this machine",
+            hint=f"unset {PROVIDER_VARIABLE} to run it on the CPU",
+        )
+    return Session(path, signature, used, session)
 
 
 def _options(threads: int) -> ort.SessionOptions:
@@ -131,15 +147,8 @@ def _tensors(values: Sequence[Any]) -> tuple[Tensor, ...]:
 
 
 def _unreadable(path: Path, what: str, error: Exception) -> SemslamError:
-    reason, size = _first_line(error), path.stat().st_size
-    hint = "export the model again; `semslam models inspect FILE.onnx` looks at a file without running anything else"
-    if size == 0:
-        reason, hint = "the file is empty", "copy or export it again"
-    elif "data" in reason and ("external" in reason.lower() or ".data" in reason):
-        hint = "its weights lie in a second file: put that beside it, or export with external_data=False"
-    elif "Protobuf parsing failed" in reason or "InvalidProtobuf" in type(error).__name__:
-        reason, hint = f"not an ONNX model, or cut short ({size:,} bytes)", "copy or export it again"
-    elif "opset" in reason.lower() or "IR version" in reason:
+    reason, hint = _first_line(error), "copy or export it again"
+    if "opset" in reason.lower() or "IR version" in reason:
         hint = "export with an older opset, or install a newer onnxruntime"
     return SemslamError(f"Cannot open {what} `{path}`: {reason}", hint=hint)
 
@@ -147,8 +156,3 @@ def _unreadable(path: Path, what: str, error: Exception) -> SemslamError:
 def _first_line(error: Exception) -> str:
     text = str(error).strip().splitlines()
     return (text[0] if text else type(error).__name__)[:300]
-
-
-def as_float32(values: Array) -> NDArray[np.float32]:
-    """The array as float32, without a copy if it is that already."""
-    return np.asarray(values, np.float32)

@@ -20,8 +20,8 @@ from semslam.errors import SemslamError, UsageError
 from semslam.pipeline.threads import ONE_THREAD
 
 if TYPE_CHECKING:
-    from semslam.pipeline.config import Config
     from semslam.pipeline.console import Console
+    from semslam.stages.check import CheckReport
     from semslam.stages.contract import Stage
 
 INTERRUPTED = 130
@@ -352,13 +352,14 @@ def status(context: click.Context, out: Path, as_json: bool) -> None:
 def why(context: click.Context, /, stage: str, log: str, out: Path, as_json: bool, **given: Any) -> None:
     """Explain why a stage ran, or would run.
 
-    STAGE may name a variant (localize/paper), LOG is a name that `semslam status` shows or a file. Options of
-    `semslam run` that change the configuration may be given; without any, that of the last run counts.
+    STAGE may name a variant (localize/paper), LOG is a name that `semslam status` shows or a file. The next run is
+    taken to have the configuration of the last one, changed by the options given here, or that of --config.
 
     \b
     Example:
       semslam why extract kitchen --out OUT --set extract.min_score=0.4
     """
+    from semslam.pipeline.config import load_config
     from semslam.pipeline.folder import open_folder
     from semslam.pipeline.why import as_json as reasons_json
     from semslam.pipeline.why import find_record
@@ -366,22 +367,13 @@ def why(context: click.Context, /, stage: str, log: str, out: Path, as_json: boo
 
     folder = open_folder(out)
     record = find_record(folder, log)
-    config = _config_like(_stages(context), record.config, f"the record of `{record.name}`", given)
+    stored = None if given["config_file"] else record.config
+    config = load_config(_stages(context), given["config_file"], given["assignments"], _settings(given), stored)
     reasons = explain(folder, _stages(context), stage, record, config)
     if as_json:
         _print_json(reasons_json(record.name, reasons))
     else:
         click.echo("\n".join(reason.text() for reason in reasons))
-
-
-def _config_like(stages: Sequence[Stage], recorded: Mapping[str, Any], source: str, given: Mapping[str, Any]) -> Config:
-    """The configuration that the options make, or without any the recorded one."""
-    from semslam.pipeline.config import config_from_json, load_config
-
-    settings = _settings(given)
-    if settings or given["config_file"] or given["assignments"]:
-        return load_config(stages, given["config_file"], given["assignments"], settings)
-    return config_from_json(stages, recorded, source)
 
 
 @cli.command()
@@ -524,16 +516,21 @@ def _check(context: click.Context, given: Mapping[str, Any]) -> int:
     found = discover(given["logs"])
     explicit = context.get_parameter_source("out") == click.core.ParameterSource.COMMANDLINE
     beside = given["out"].parent if explicit else Path()
-    reports = [
-        check_log(log.sources, resolved.of(stages[0]).topics, beside / f"{log.name}.check.png") for log in found.logs
-    ]
+    reports: list[CheckReport] = []
+    failed = bool(found.problems)
+    for log in found.logs:
+        try:
+            reports.append(check_log(log.sources, resolved.of(stages[0]).topics, beside / f"{log.name}.check.png"))
+        except SemslamError as error:
+            _console().error(error)
+            failed = True
     if given["as_json"]:
         _print_json([report.as_json() for report in reports])
-    else:
+    elif reports:
         click.echo("\n\n".join(report.text() for report in reports))
     for problem in found.problems:
         _console().error(SemslamError(f"`{problem.path}` was left out: {problem.reason}"))
-    return 0 if all(report.ok for report in reports) and not found.problems else 1
+    return 0 if all(report.ok for report in reports) and not failed else 1
 
 
 if __name__ == "__main__":

@@ -64,14 +64,19 @@ def load_config(
     file: Path | None = None,
     assignments: Sequence[str] = (),
     options: Mapping[str, Any] | None = None,
+    stored: Mapping[str, Any] | None = None,
 ) -> Config:
     """Resolve defaults, then the file, then `--set KEY=VALUE`, then options given as {"section.key": value}.
+
+    Args:
+        stored: an earlier configuration as `Config.as_json` gave it, in the place of the defaults.
 
     Raises:
         UsageError: the file cannot be read, or a key or value is wrong.
     """
     values: dict[str, dict[str, Any]] = {stage.name: {} for stage in stages}
     classes = {stage.name: stage.config for stage in stages}
+    _merge(values, _checked(classes, stored or {}, _Where("the stored configuration", Path.cwd())))
     if file is not None:
         _merge(values, _checked(classes, _read_toml(file), _Where(f"`{file}`", file.resolve().parent)))
     for text in assignments:
@@ -82,12 +87,6 @@ def load_config(
     for stage in stages:
         _check_variants(stage, config)
     return config
-
-
-def config_from_json(stages: Sequence[Stage], stored: Mapping[str, Any], source: str) -> Config:
-    """The configuration that `Config.as_json` gave, checked again."""
-    checked = _checked({stage.name: stage.config for stage in stages}, stored, _Where(source, Path.cwd()))
-    return Config({stage.name: _build(stage.config, checked.get(stage.name, {})) for stage in stages})
 
 
 def plain(value: Any) -> Any:

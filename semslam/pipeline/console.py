@@ -307,7 +307,7 @@ def _pace(unit: str, start: float, first: int, done: int, total: int | None) -> 
     rate = (done - first) / max(time.monotonic() - start, 1e-3)
     text = f"{done:,}/{total:,} {unit}" if total else f"{done:,} {unit}"
     left = f", {(total - done) / rate:.0f} s left" if total and rate > 0 else ""
-    return f"{text}, {rate:.1f} {unit}/s{left}"
+    return f"{text}, {rate:.1f} {unit}/s{left}" if rate > 0 else text
 
 
 class _Bars(_Progress):

@@ -147,7 +147,7 @@ def _sibling_hint(path: Path) -> str:
         beside = os.listdir(path.parent)
     except OSError:
         return f"there is no folder `{path.parent}` either"
-    close = difflib.get_close_matches(path.name, beside, n=1)
+    close = difflib.get_close_matches(path.name, beside, n=1, cutoff=0.75)
     return f"did you mean `{path.parent / close[0]}`?" if close else "check the path, or name a folder"
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,6 +32,8 @@ FORMAT = "semslam"
 FORMAT_VERSION = 1
 _MARK = "semslam.json"
 _LOCK = ".lock"
+_LOCK_TRIES = 5
+_LOCK_PAUSE_S = 0.02
 
 
 @dataclass(frozen=True)
@@ -66,10 +69,16 @@ class OutputFolder:
     def busy(self) -> bool:
         """Whether a run holds the folder now."""
         try:
-            with self.locked():
-                return False
-        except SemslamError:
+            descriptor = os.open(self.root / _LOCK, os.O_RDONLY)
+        except FileNotFoundError:
+            return False
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
             return True
+        finally:
+            os.close(descriptor)
+        return False
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -81,15 +90,24 @@ class OutputFolder:
         path = self.root / _LOCK
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise _busy(self.root, path) from None
+            if not _try_lock(descriptor):
+                raise _busy(self.root, path)
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
             yield
         finally:
             os.close(descriptor)
+
+
+def _try_lock(descriptor: int) -> bool:
+    """Lock at once or after a moment, which is as long as `busy` holds on to it."""
+    for _ in range(_LOCK_TRIES):
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        except BlockingIOError:
+            time.sleep(_LOCK_PAUSE_S)
+    return False
 
 
 def create_folder(root: Path) -> OutputFolder:

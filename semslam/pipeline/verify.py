@@ -27,7 +27,7 @@ from semslam.pipeline.cache import (
     shard_digest,
     shard_name,
 )
-from semslam.pipeline.config import config_from_json
+from semslam.pipeline.config import load_config
 from semslam.pipeline.console import Console, byte_bar
 from semslam.pipeline.digest import sha256_file
 from semslam.pipeline.discover import Log
@@ -247,7 +247,7 @@ def _run_again(
     again: OutputFolder, stages: Sequence[Stage], records: Sequence[LogRecord], workers: int | None, console: Console
 ) -> tuple[TaskResult, ...]:
     first = records[0]
-    config = config_from_json(stages, first.config, f"the record of `{first.name}`")
+    config = load_config(stages, stored=first.config)
     logs = [Log(record.name, tuple(map(Path, record.sources))) for record in records]
     report = run_logs(again, stages, _last_stage(stages, first), config, logs, workers, console)
     return report.results

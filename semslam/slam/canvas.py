@@ -85,7 +85,7 @@ class Canvas:
 
     def png(self) -> bytes:
         """The picture as a PNG file."""
-        done, data = cv2.imencode(".png", self.image, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        done, data = cv2.imencode(".png", self.image, [cv2.IMWRITE_PNG_COMPRESSION, 6])
         if not done:
             raise RuntimeError("OpenCV could not encode a PNG")
         return bytes(data)

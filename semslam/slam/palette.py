@@ -27,7 +27,7 @@ OBJECTS: tuple[Colour, ...] = tuple(
     _rgb(text)
     for text in (
         "E69F00", "56B4E9", "009E73", "0072B2", "F0E442", "D55E00", "882255", "44AA99",
-        "999933", "332288", "DDAA77", "117733", "8C564B", "7FC97F", "B07AE0", "A0522D",
+        "999933", "332288", "DDAA77", "117733", "8C564B", "7FC97F", "B07AE0", "00CED1",
     )
 )  # fmt: skip
 """Okabe and Ito 2008, then Tol's muted set and fillers; pinks are left to the trajectory, greys to the background."""

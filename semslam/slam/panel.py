@@ -29,6 +29,8 @@ _MAX_PIXELS = 4000
 _MAX_LABELS = 24
 _LABEL_M2 = 0.05
 """Smaller blobs get no label."""
+_LABEL_INSIDE = 26
+"""Lower blobs, in pixels, are labelled above or below, so that the label does not hide them."""
 _ARROW_EVERY = 90.0
 """Pixels of path between direction arrows."""
 
@@ -192,8 +194,8 @@ def _draw_path(canvas: Canvas, path: Path, view: View) -> list[tuple[float, floa
         return []
     for pieces, colour, thickness in (
         (_pieces(path, view), PAGE, 6),
-        (_gaps(path, view), PAGE, 3),
-        (_gaps(path, view), TRACK, 1),
+        (_gaps(path, view), PAGE, 4),
+        (_gaps(path, view), TRACK, 2),
         (_pieces(path, view), TRACK, 3),
     ):
         for piece in pieces:
@@ -249,7 +251,8 @@ def _draw_labels(
         name = classes[class_id]
         half = canvas.text_width(name, 14, MEDIUM) / 2 + 3
         x = min(max(x, LEFT + half + 2), LEFT + view.width - half - 2)
-        for baseline in (middle + 5, top - 5, bottom + 16):
+        beside = (top - 6, bottom + 17)
+        for baseline in (middle + 5, *beside) if bottom - top >= _LABEL_INSIDE else (*beside, middle + 5):
             box = (x - half, baseline - 14, x + half, baseline + 5)
             inside = box[1] >= TOP and box[3] <= TOP + view.height
             if inside and not any(_overlap(box, other) for other in boxes):

@@ -231,13 +231,15 @@ def place_observation(rotated: Planes, field: Field, window: Window) -> Planes:
     rows, columns = (w.stop - w.start for w in window)
     mass = _whole(_around(field, window, side // 2), FIELD_BITS)  # (R, rows + h - 1, columns + h - 1)
     turns = np.flatnonzero(mass.any((1, 2)))
+    result = np.zeros((rotated.shape[1], rows, columns), np.float32)
+    if not turns.size or not result.size:
+        return result
     mass, kernels = mass[turns], _whole(rotated[np.ix_(turns, present)], WEIGHT_BITS)
     placed = np.zeros((len(present), rows, columns), np.float64)
     for i in range(side):
         pieces = _sum_headings(kernels[:, :, i], mass[:, side - 1 - i : side - 1 - i + rows])
         for j in range(side):
             placed += pieces[:, j, :, side - 1 - j : side - 1 - j + columns]
-    result = np.zeros((rotated.shape[1], rows, columns), np.float32)
     result[present] = placed * 0.5 ** (WEIGHT_BITS + FIELD_BITS)
     return result
 
@@ -253,7 +255,7 @@ def _sum_headings(kernels: NDArray[np.float64], mass: NDArray[np.float64]) -> ND
     """Kernel rows (R, K, h) times masses (R, rows, columns), summed over headings -> (K, h, rows, columns)."""
     headings, spread = len(mass), mass.reshape(len(mass), -1)
     cells = np.flatnonzero(spread.any(0))
-    pieces = np.zeros((kernels[0].size if headings else 0, spread.shape[1]), np.float64)
+    pieces = np.zeros((kernels[0].size, spread.shape[1]), np.float64)
     pieces[:, cells] = kernels.reshape(headings, -1).T @ spread[:, cells]
     return pieces.reshape(*kernels.shape[1:], *mass.shape[1:])
 

@@ -13,6 +13,7 @@ that goes on takes up the state of the last finished shard: the bytes are those 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -51,6 +52,7 @@ def run(ctx: StageContext) -> None:
                 ctx.progress(done, motion.rows)
             if stop == motion.rows:
                 tables["cells"].append(track.cells())
+            track.warn(shard)
             shard.path(_STATE).write_bytes(track.state())
 
 
@@ -64,6 +66,8 @@ class _Track:
         self._estimator: Estimator = open_estimator(ctx.variant, config, self._classes, self._cell_m, self._side)
         self._evidence = Evidence(self._cell_m, self._side)
         self._last = SE2(0.0, 0.0, 0.0)
+        self._half_m = _half_side_m(self._estimator.belief())
+        self._outside = 0
         self.meta = {"classes": list(self._classes), "cell_m": self._cell_m, "estimator": ctx.variant}
 
     @property
@@ -78,6 +82,7 @@ class _Track:
         if estimate.map_from_robot is None:
             return estimate
         self._last = estimate.map_from_robot
+        self._outside += max(abs(self._last.x_m), abs(self._last.y_m)) > self._half_m
         if step.observation is not None and not self._evidence.add(step.observation, self._last, step.stamp_nanos):
             shard.count("observations_off_the_map")
         return estimate
@@ -93,6 +98,15 @@ class _Track:
         centres = {f"{axis}_m": (cells[f"i{axis}"] + 0.5) * self._cell_m for axis in "xy"}
         labels = [self._classes[class_id] for class_id in cells["class_id"]]
         return {**cells, **centres, "label": labels}
+
+    def warn(self, shard: ShardWriter) -> None:
+        """Say how many keyframes since the last call lay off the estimator's own map, where it cannot see."""
+        if self._outside:
+            shard.warn(
+                f"{self._outside} keyframes lie outside the map of `{self.meta['estimator']}`, "
+                f"{2 * self._half_m:.1f} m wide about the start; raise `localize.paper.map_side`"
+            )
+        self._outside = 0
 
     def state(self) -> bytes:
         """Estimator, map and last pose."""
@@ -153,6 +167,11 @@ def _planes(row: Mapping[str, Any], shape: tuple[int, int, int]) -> Planes:
         ) from error
     planes[UNOBSERVED] = ~planes[1:].any(0)
     return planes
+
+
+def _half_side_m(belief: Belief | None) -> float:
+    """From the middle of the estimator's map, where it starts, to its border; infinite without one."""
+    return -belief.origin_x_m if belief else math.inf
 
 
 def _sparse(belief: Belief) -> Snapshot:

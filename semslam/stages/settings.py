@@ -123,10 +123,11 @@ class PaperConfig:
     """Set observation cells above the noise floor to 1."""
     temperature: float = setting(1.0, low=1e-6, high=1e6)
     """Correlation is divided by this before the softmax of equation 2; 1 in the paper."""
-    gate_distance_m: float = setting(0.6, low=0.0, high=1e6)
-    """Largest position difference of visual and inertial pose, metres. gamma_1."""
-    gate_heading_rad: float = setting(0.3, low=0.0, high=3.2)
-    """Largest heading difference, radians. gamma_2."""
+    gate_distance_m: float = setting(0.3, low=0.0, high=1e6)
+    """Largest position difference of visual and inertial pose, metres: 3 sigma of a step's noise (0.09 m) and the
+    rounding to a cell (half its diagonal, 0.21 m). gamma_1."""
+    gate_heading_rad: float = setting(0.1, low=0.0, high=3.2)
+    """Largest heading difference, radians: 3 sigma of a step's noise (0.08 rad) and half a degree of bias. gamma_2."""
     gate: str = setting("all", choices=("all", "any"))
     """Accept the visual pose if all, or any, of the two differences are below their gates (equation 4 says all)."""
     leak: float = setting(0.3, low=0.0, high=1.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from semslam.errors import SemslamError
 from semslam.models.class_names import names_from_file, names_from_metadata
 from semslam.models.detections import Detections, Floats, Letterbox
-from semslam.models.detectors.layout import Array
+from semslam.models.detectors.layout import Array, input_size, one_picture
 from semslam.models.detectors.nanodet import Nanodet
 from semslam.models.detectors.yolov5 import Yolov5
 from semslam.models.detectors.yolov8 import Yolov8
@@ -43,8 +43,8 @@ class Adapter(Protocol):
         """Number of classes of a model that fits."""
 
 
-ADAPTERS: tuple[Adapter, ...] = (Yolox(), Nanodet(), Yolov5(), Yolov8(), Yolox("yolox_decoded", decoded=True))
-"""All layouts, tried in this order. `yolox_decoded` looks like `yolox` and is taken only when named."""
+ADAPTERS: tuple[Adapter, ...] = (Yolox(), Yolox("yolox_decoded", decoded=True), Nanodet(), Yolov5(), Yolov8())
+"""All layouts, tried in this order."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,8 @@ class Detector:
     """Finds objects in pictures."""
 
     session: Session
+    signature: Signature
+    """That of the session, with the sizes of outputs that only a run tells."""
     adapter: Adapter
     class_names: tuple[str, ...]
 
@@ -69,9 +71,10 @@ class Detector:
             SemslamError: the file is no usable model, no adapter fits, or names are missing or of the wrong number.
         """
         session = open_session(path, threads=threads, what="detector")
-        chosen = _choose(session, adapter)
-        names = _names(session, chosen.classes(session.signature), classes_path)
-        return Detector(session, chosen, names)
+        signature = with_known_sizes(session)
+        chosen = _choose(session, signature, adapter)
+        names = _names(session, chosen.classes(signature), classes_path)
+        return Detector(session, signature, chosen, names)
 
     @property
     def name(self) -> str:
@@ -85,10 +88,21 @@ class Detector:
 
     def __call__(self, rgb: NDArray[np.uint8], min_score: float, max_overlap: float) -> Detections:
         """Objects in a picture (H, W, 3) RGB."""
-        signature = self.session.signature
-        tensor, box = self.adapter.preprocess(rgb, signature)
-        outputs = self.session.run({signature.inputs[0].name: tensor})
-        return self.adapter.postprocess(outputs, box, signature, min_score, max_overlap)
+        tensor, box = self.adapter.preprocess(rgb, self.signature)
+        outputs = self.session.run({self.signature.inputs[0].name: tensor})
+        return self.adapter.postprocess(outputs, box, self.signature, min_score, max_overlap)
+
+
+def with_known_sizes(session: Session) -> Signature:
+    """The signature with every output size a number: where the file leaves one open, an empty picture is run."""
+    signature = session.signature
+    known = all(isinstance(size, int) for tensor in signature.outputs for size in tensor.shape)
+    if known or one_picture(signature):
+        return signature
+    picture = np.zeros((1, 3, *input_size(signature)), np.float32)
+    outputs = session.run({signature.inputs[0].name: picture})
+    tensors = (replace(tensor, shape=tuple(out.shape)) for tensor, out in zip(signature.outputs, outputs, strict=True))
+    return replace(signature, outputs=tuple(tensors))
 
 
 def matching(signature: Signature) -> tuple[Adapter | None, dict[str, str]]:
@@ -102,16 +116,16 @@ def matching(signature: Signature) -> tuple[Adapter | None, dict[str, str]]:
     return None, reasons
 
 
-def _choose(session: Session, wanted: str) -> Adapter:
+def _choose(session: Session, signature: Signature, wanted: str) -> Adapter:
     if wanted == "auto":
-        adapter, reasons = matching(session.signature)
+        adapter, reasons = matching(signature)
         if adapter is None:
             raise _no_adapter(session, reasons)
         return adapter
     by_name = {adapter.name: adapter for adapter in ADAPTERS}
     if wanted not in by_name:
         raise SemslamError(f"No detector adapter `{wanted}`", hint=f"adapters are auto, {', '.join(by_name)}")
-    reason = by_name[wanted].mismatch(session.signature)
+    reason = by_name[wanted].mismatch(replace(signature, operators=None))  # who names a layout knows the graph
     if reason:
         raise SemslamError(
             f"Detector `{session.path}` is not of layout `{wanted}`: {reason}",
@@ -126,7 +140,7 @@ def _no_adapter(session: Session, reasons: dict[str, str]) -> SemslamError:
     return SemslamError(
         f"No adapter fits detector `{session.path}`",
         details=f"{session.signature.text()}\nTried\n{tried}",
-        hint="export the model in one of these layouts",
+        hint="export it in one of these layouts, or name the one it has with `--set extract.adapter=NAME`",
     )
 
 

@@ -23,7 +23,7 @@ def one_picture(signature: Signature) -> str:
     tensor = signature.inputs[0]
     if len(tensor.shape) != 4 or tensor.shape[1] != 3:
         return f"wants an input (1, 3, height, width), found {tensor}"
-    if tensor.type != "tensor(float)":
+    if tensor.type not in ("tensor(float)", "tensor(float16)"):
         return f"wants a float input, found {tensor.type}"
     return "" if tensor.shape[0] == 1 or isinstance(tensor.shape[0], str) else f"wants batches of 1, found {tensor}"
 

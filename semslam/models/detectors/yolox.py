@@ -21,7 +21,7 @@ _STRIDES = (8, 16, 32)
 
 @dataclass(frozen=True)
 class Yolox:
-    """The adapter; `decoded` says that boxes come in pixels already."""
+    """The adapter; `decoded` says that boxes come in pixels already, which the exponential in the graph betrays."""
 
     name: str = "yolox"
     decoded: bool = False
@@ -36,6 +36,10 @@ class Yolox:
         rows = signature.outputs[0].shape[1]
         if rows != cells:
             return f"output has {rows} rows, a {width}x{height} input has {cells} cells"
+        if signature.operators is not None and ("Exp" in signature.operators) != self.decoded:
+            return (
+                f"its graph holds {'no ' if self.decoded else ''}Exp: boxes are {'not ' if self.decoded else ''}decoded"
+            )
         return ""
 
     def preprocess(self, rgb: NDArray[np.uint8], signature: Signature) -> tuple[Floats, Letterbox]:

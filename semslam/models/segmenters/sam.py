@@ -98,12 +98,18 @@ class SamSegmenter:
         else:
             feeds["point_coords"] = prompt.reshape(1, 2, 2)
             feeds["point_labels"] = np.array([[2.0, 3.0]], np.float32)
-            feeds["mask_input"] = np.zeros((1, 1, _LOW_MASK, _LOW_MASK), np.float32)
+            feeds["mask_input"] = np.zeros((1, 1, *self._low_size()), np.float32)
             feeds["has_mask_input"] = np.zeros(1, np.float32)
             if "orig_im_size" in names:
                 feeds["orig_im_size"] = np.array([height, width], np.float32)
         outputs = dict(zip((t.name for t in self.decoder.signature.outputs), self.decoder.run(feeds), strict=True))
         return self._full_size(_best_mask(outputs), scale, height, width) > 0
+
+    def _low_size(self) -> tuple[int, int]:
+        """Height and width of the decoder's mask prompt."""
+        shape = next(tensor.shape for tensor in self.decoder.signature.inputs if tensor.name == "mask_input")
+        height, width = (size if isinstance(size, int) else _LOW_MASK for size in shape[-2:])
+        return height, width
 
     def _full_size(self, logits: Floats, scale: float, height: int, width: int) -> Floats:
         """Logits (h, w) over the padded square, or over the picture, at the picture's size."""
@@ -116,7 +122,8 @@ class SamSegmenter:
 
 def _best_mask(outputs: dict[str, NDArray[Any]]) -> Floats:
     """Logits (h, w) of the mask the decoder likes best."""
-    masks = np.asarray(outputs.get("masks", next(iter(outputs.values()))), np.float32)
+    named = [outputs[name] for name in ("masks", "low_res_masks") if name in outputs]
+    masks = np.asarray((named or [value for value in outputs.values() if value.ndim >= 3])[0], np.float32)
     masks = masks.reshape(-1, *masks.shape[-2:])
     liked = outputs.get("iou_predictions")
     best = 0 if liked is None else int(np.nan_to_num(np.asarray(liked, np.float32).ravel()[: len(masks)]).argmax())

@@ -1,0 +1,134 @@
+"""Step time of the paper's estimator against one bare ONNX Runtime convolution of the same size, in the same run.
+
+    python benchmarks/correlate.py [--quick]
+
+The baseline is the convolution alone: map (1, 10, 33, 33), kernels (360, 10, 11, 11), float32, zero padded. The
+estimator's step has that correlation in it, in exact arithmetic, and everything else too: pooling, rotating, softmax,
+modes, placing, map update. One thread each. `dense` has weight in every cell of every class; `room` has what a camera
+sees of one: four of ten classes, a few cells each.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+import argparse
+import datetime
+import platform
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+import onnx
+import onnxruntime
+
+from semslam.geometry.frames import SE2
+from semslam.geometry.grid import Planes, pool_observation
+from semslam.labels import FIRST_OBJECT, FREE_FLOOR, UNOBSERVED, class_list
+from semslam.slam.estimator import Step
+from semslam.slam.paper import correlate, rotate_observation
+from semslam.slam.registry import open_estimator
+from semslam.stages.settings import LocalizeConfig, PaperConfig
+
+CELL_M, SIDE = 0.1, 99
+CLASSES = class_list([f"class {i}" for i in range(10)])
+PAPER = PaperConfig()
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="three rounds, to exercise the code")
+    rounds = 3 if parser.parse_args().quick else 40
+    print(f"{platform.machine()}, {os.cpu_count()} cores, {_processor()}, Python {platform.python_version()}")
+    print(f"numpy {np.__version__}, onnxruntime {onnxruntime.__version__}, {datetime.date.today().isoformat()}")
+    sizes = f"L = {len(CLASSES) - FIRST_OBJECT} object classes, h = {PAPER.side}, R = {PAPER.headings}"
+    print(f"{rounds} rounds, median; {sizes}")
+    print(f"{'case':6} {'convolution':>14} {'correlate':>14} {'whole step':>14}   ratio to the convolution")
+    for name, make in (("dense", dense_observation), ("room", room_observation)):
+        baseline, alone, whole = (statistics.median(times) * 1e3 for times in measure(make, rounds))
+        ratios = f"{alone / baseline:5.2f} {whole / baseline:5.2f}"
+        print(f"{name:6} {baseline:11.1f} ms {alone:11.1f} ms {whole:11.1f} ms   {ratios}")
+
+
+def measure(make: Callable[[int], Planes], rounds: int) -> tuple[list[float], list[float], list[float]]:
+    """Seconds of convolution, correlation and whole step, taken in turns."""
+    estimator = open_estimator("paper", LocalizeConfig(paper=PAPER), CLASSES, CELL_M, SIDE)
+    convolve = _convolution()
+    times: tuple[list[float], list[float], list[float]] = ([], [], [])
+    for frame in range(rounds + 2):
+        belief = estimator.belief()
+        assert belief is not None
+        observation = make(frame)
+        rotated = rotate_observation(pool_observation(observation, 3, PAPER.side), PAPER.headings)
+        kernels = np.ascontiguousarray(rotated[:, FIRST_OBJECT:])
+        image = np.ascontiguousarray(belief.planes[None, FIRST_OBJECT:])
+        step = Step(frame, frame, observation, SE2(0.05, 0.0, 0.02) if frame else None)
+        for kept, action in zip(
+            times,
+            (
+                lambda image=image, kernels=kernels: convolve(image, kernels),
+                lambda rotated=rotated, belief=belief: correlate(rotated, belief.planes),
+                lambda step=step: estimator.step(step),
+            ),
+            strict=True,
+        ):
+            start = time.perf_counter()
+            action()
+            if frame >= 2:  # the first two fill caches
+                kept.append(time.perf_counter() - start)
+    return times
+
+
+def dense_observation(seed: int) -> Planes:
+    """Weight everywhere."""
+    planes = np.random.default_rng(seed).random((len(CLASSES), SIDE, SIDE), np.float32)
+    planes[UNOBSERVED] = 0.0
+    return planes
+
+
+def room_observation(seed: int) -> Planes:
+    """Four classes ahead of the robot, half a metre wide, on a floor seen 90 degrees wide."""
+    random = np.random.default_rng(seed)
+    planes = np.zeros((len(CLASSES), SIDE, SIDE), np.float32)
+    y, x = np.mgrid[:SIDE, :SIDE] - SIDE // 2
+    planes[FREE_FLOOR] = (x > 0) & (np.abs(y) < x)
+    for class_id in FIRST_OBJECT + random.choice(4, 4, replace=False):
+        row, column = 49 + random.integers(-8, 8), 49 + random.integers(6, 14)
+        planes[class_id, row - 2 : row + 3, column - 2 : column + 3] = 0.04
+    planes[UNOBSERVED] = ~planes[1:].any(0)
+    return planes
+
+
+def _convolution() -> Callable[[Planes, Planes], Planes]:
+    """ONNX Runtime's Conv with run-time weights, one thread."""
+    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
+    node = helper.make_node("Conv", ["x", "w"], ["y"], pads=[PAPER.side // 2] * 4)
+    inputs = [helper.make_tensor_value_info(name, kind, [None] * 4) for name in "xw"]
+    graph = helper.make_graph([node], "conv", inputs, [helper.make_tensor_value_info("y", kind, [None] * 4)])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+
+    def convolve(image: Planes, kernels: Planes) -> Planes:
+        result: Planes = session.run(None, {"x": image, "w": kernels})[0]
+        return result
+
+    return convolve
+
+
+def _processor() -> str:
+    """The processor's name, where the system tells it."""
+    try:
+        with open("/proc/cpuinfo", encoding="ascii", errors="replace") as lines:
+            return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or "unknown processor"
+
+
+if __name__ == "__main__":
+    main()

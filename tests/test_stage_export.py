@@ -1,0 +1,173 @@
+"""The export stage: every file read back by other means than those that wrote it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from evo.tools import file_interface
+
+from semslam.errors import SemslamError
+from semslam.labels import FREE_FLOOR, OBSTACLE, class_list
+from semslam.slam import exchange
+from semslam.stages import export
+from semslam.stages.contract import FinishedShard
+from semslam.stages.settings import ExportConfig
+from semslam.tables.parquet import TableFiles, write_table
+from semslam.tables.spec import CELLS, POSES, TRAJECTORY
+from tests.slam_world import MemoryContext
+
+CLASSES = class_list(("chair",))
+META = {"classes": list(CLASSES), "cell_m": 0.1, "estimator": "paper"}
+STAMP = 1_700_000_000_123_456_789
+ROS = ExportConfig(occupied_threshold=0.65, free_threshold=0.196)
+
+
+def write_poses(path: Path, poses: list[tuple[float, float, float] | None]) -> None:
+    nothing: list[Any] = [None] * len(poses)
+    lists: list[list[float]] = [[] for _ in poses]
+    columns = {
+        name: [pose[i] if pose else None for pose in poses] for i, name in enumerate(("x_m", "y_m", "heading_rad"))
+    }
+    rows = {
+        "frame": list(range(len(poses))), "stamp_nanos": [STAMP + i * 10**9 for i in range(len(poses))], **columns,
+        "source": ["inertial" if pose else "none" for pose in poses], "peak": nothing, "entropy_nats": nothing,
+        "mode_x_m": lists, "mode_y_m": lists, "mode_heading_rad": lists, "mode_probability": lists,
+    }  # fmt: skip
+    write_table(path, POSES, rows, META)
+
+
+def write_cells(path: Path, cells: dict[tuple[int, int], int]) -> None:
+    ix, iy = [x for x, _ in cells], [y for _, y in cells]
+    count = len(cells)
+    rows = {
+        "ix": ix, "iy": iy, "x_m": [(i + 0.5) * 0.1 for i in ix], "y_m": [(i + 0.5) * 0.1 for i in iy],
+        "class_id": list(cells.values()), "label": [CLASSES[i] for i in cells.values()], "probability": [0.7] * count,
+        "hits": [2] * count, "views": [3] * count, "first_seen_nanos": [1] * count, "last_seen_nanos": [2] * count,
+    }  # fmt: skip
+    write_table(path, CELLS, rows, META)
+
+
+def exported(
+    folder: Path,
+    poses: list[tuple[float, float, float] | None],
+    cells: dict[tuple[int, int], int],
+    config: ExportConfig = ROS,
+) -> MemoryContext:
+    folder.mkdir(parents=True, exist_ok=True)
+    write_poses(folder / "poses.parquet", poses)
+    write_cells(folder / "cells.parquet", cells)
+    inputs = {table.name: TableFiles(table, [folder / f"{table.name}.parquet"]) for table in (POSES, CELLS)}
+    context = MemoryContext(folder / "out", inputs, config, "paper")
+    export.run(context)
+    return context
+
+
+POSE_LIST: list[tuple[float, float, float] | None] = [(0.0, 0.0, 0.0), None, (1.25, -0.5, math.pi / 2)]
+CELL_LIST = {(-3, -2): FREE_FLOOR, (-2, -2): OBSTACLE, (0, 1): 3}
+
+
+def test_all_files_are_there(tmp_path: Path) -> None:
+    """Exactly these."""
+    context = exported(tmp_path, POSE_LIST, CELL_LIST)
+    assert sorted(path.name for path in (context.folder / "shard-0").iterdir()) == [
+        "map.parquet", "map.pgm", "map.png", "map.yaml", "trajectory.parquet", "trajectory.tum",
+    ]  # fmt: skip
+    assert context.done[-1] == (5, 5)
+    assert context.shards[0].warnings == []
+
+
+def test_trajectory_leaves_out_keyframes_without_a_pose(tmp_path: Path) -> None:
+    """Table and TUM file agree; stamps keep all nine decimals."""
+    context = exported(tmp_path, POSE_LIST, CELL_LIST)
+    rows = context.results(TRAJECTORY)["trajectory"].read()
+    assert rows == {
+        "frame": [0, 2], "stamp_nanos": [STAMP, STAMP + 2 * 10**9], "x_m": [0.0, 1.25], "y_m": [0.0, -0.5],
+        "heading_rad": [0.0, math.pi / 2],
+    }  # fmt: skip
+    lines = (context.folder / "shard-0" / "trajectory.tum").read_text().splitlines()
+    assert lines[1].split()[0] == "1700000002.123456789"
+    track = file_interface.read_tum_trajectory_file(str(context.folder / "shard-0" / "trajectory.tum"))
+    np.testing.assert_allclose(track.positions_xyz, [[0, 0, 0], [1.25, -0.5, 0]])
+    np.testing.assert_allclose(track.get_orientations_euler()[:, 2], [0, math.pi / 2])
+
+
+def test_map_server_files(tmp_path: Path) -> None:
+    """First row on top, lower left corner as origin, three grey values that map_server tells apart."""
+    shard = exported(tmp_path, POSE_LIST, CELL_LIST).folder / "shard-0"
+    yaml = dict(line.split(": ", 1) for line in (shard / "map.yaml").read_text().splitlines())
+    assert yaml == {
+        "image": "map.pgm", "mode": "trinary", "resolution": "0.100000", "origin": "[-0.300000, -0.200000, 0.0]",
+        "negate": "0", "occupied_thresh": "0.65", "free_thresh": "0.196",
+    }  # fmt: skip
+    image = cv2.imread(str(shard / "map.pgm"), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    assert image.tolist() == [[205, 205, 205, 0], [205, 205, 205, 205], [205, 205, 205, 205], [254, 0, 205, 205]]
+
+
+@pytest.mark.parametrize(("free", "occupied"), [(0.196, 0.65), (0.25, 0.65), (0.1, 0.15), (0.0, 1.0), (0.5, 0.9)])
+def test_map_server_reads_the_three_values_as_meant(free: float, occupied: float) -> None:
+    """Also under thresholds that would turn the customary 205 into free floor or wall."""
+    occupancy = [(255 - grey) / 255 for grey in (0, 254, exchange.unknown_grey(free, occupied))]
+    assert occupancy[0] >= occupied
+    assert occupancy[1] <= max(free, 1 / 255)
+    assert free <= occupancy[2] <= occupied
+
+
+def test_thresholds_without_room_between_them_are_refused(tmp_path: Path) -> None:
+    """Both keys are named."""
+    with pytest.raises(SemslamError) as caught:
+        exported(tmp_path, POSE_LIST, CELL_LIST, ExportConfig(free_threshold=0.7, occupied_threshold=0.3))
+    assert "`export.free_threshold`" in caught.value.text()
+    assert "`export.occupied_threshold`" in caught.value.text()
+
+
+def test_map_parquet_stands_alone(tmp_path: Path) -> None:
+    """Any Parquet reader, all columns; class list and cell in the metadata."""
+    shard = exported(tmp_path, POSE_LIST, CELL_LIST).folder / "shard-0"
+    table = pq.read_table(shard / "map.parquet")
+    assert table.column_names == [c.name for c in CELLS.columns]
+    assert table.column("label").to_pylist() == ["free_floor", "obstacle", "chair"]
+    assert TableFiles(CELLS, [shard / "map.parquet"]).meta == META
+
+
+def test_an_empty_map_and_no_poses(tmp_path: Path) -> None:
+    """Every file is still there and can be read."""
+    shard = exported(tmp_path, [], {}).folder / "shard-0"
+    picture = cv2.imread(str(shard / "map.png"))
+    occupancy = cv2.imread(str(shard / "map.pgm"), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    assert picture.shape[1] > 800
+    assert occupancy is not None
+    assert occupancy.tolist() == [[205]]
+    assert (shard / "trajectory.tum").read_text() == ""
+
+
+def test_a_torn_map_warns_instead_of_filling_the_disk(tmp_path: Path) -> None:
+    """Two cells a thousand kilometres apart: no PGM, but a picture, and a word about it."""
+    context = exported(tmp_path, POSE_LIST, {(0, 0): OBSTACLE, (10_000_000, 10_000_000): OBSTACLE})
+    names = {path.name for path in (context.folder / "shard-0").iterdir()}
+    assert "map.pgm" not in names
+    assert "map.yaml" not in names
+    assert "map.png" in names
+    assert "map.pgm" in context.shards[0].warnings[0]
+
+
+def test_same_tables_same_bytes(tmp_path: Path) -> None:
+    """All files of two runs."""
+    first, second = (exported(tmp_path / name, POSE_LIST, CELL_LIST).folder / "shard-0" for name in ("a", "b"))
+    for path in first.iterdir():
+        assert path.read_bytes() == (second / path.name).read_bytes(), path.name
+
+
+def test_a_finished_export_is_not_repeated(tmp_path: Path) -> None:
+    """The shard is published already."""
+    context = exported(tmp_path, POSE_LIST, CELL_LIST)
+    context.finished = (FinishedShard(0, {}, {}, context.folder / "shard-0"),)
+    export.run(context)
+    assert len(context.shards) == 1
