@@ -38,6 +38,9 @@ _HOUSEHOLD = (
 )  # fmt: skip
 """Class names that have the colour of the same place in `OBJECTS` wherever they appear."""
 
+_SPELLINGS = {"diningtable": "dining table", "pottedplant": "potted plant", "tvmonitor": "tv", "sofa": "couch"}
+"""How older COCO and VOC lists spell some of them."""
+
 
 def class_colours(names: Iterable[str]) -> dict[str, Colour]:
     """A colour for every class name on one picture.
@@ -45,7 +48,7 @@ def class_colours(names: Iterable[str]) -> dict[str, Colour]:
     Known names have fixed colours, others the one their name hashes to; if that is taken, the next free one. Colours
     repeat only beyond sixteen classes.
     """
-    wanted = sorted(set(names), key=lambda name: (name not in _HOUSEHOLD, name))
+    wanted = sorted(set(names), key=lambda name: (_SPELLINGS.get(name, name) not in _HOUSEHOLD, name))
     slots: dict[str, int] = {}
     for name in wanted:
         slot = _slot(name)
@@ -56,8 +59,9 @@ def class_colours(names: Iterable[str]) -> dict[str, Colour]:
 
 
 def _slot(name: str) -> int:
-    if name in _HOUSEHOLD:
-        return _HOUSEHOLD.index(name)
+    known = _SPELLINGS.get(name, name)
+    if known in _HOUSEHOLD:
+        return _HOUSEHOLD.index(known)
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big") % len(OBJECTS)
 
 

@@ -298,7 +298,7 @@ def _topic_lines(reader: LogReader, roles: Roles, survey: _Survey) -> Iterator[T
     role_of = {topic.channel: role for role, topic in roles.topics.items()}
     for channel, _ in sorted(reader.channels(), key=lambda item: item[0].topic):
         tally = survey.tallies.get(channel, TopicTally())
-        role = role_of.get(channel, "")
+        role = role_of.get(channel) or ("tf" if kind_of(channel) == "transforms" else "")
         span = (tally.last_log_time or 0) - (tally.first_log_time or 0)
         yield TopicLine(
             topic=channel.topic,

@@ -95,8 +95,11 @@ def _close(shard: ShardWriter, walk: KeyframeWalk, roles: Roles, reader: LogRead
     shard.note("losses", losses.as_json())
     if losses.state != "ok":
         shard.count("logs_salvaged")
-        for problem in losses.problems:
-            shard.warn(problem)
+    for problem in losses.problems:
+        shard.warn(problem)
+    if losses.messages_unverified:
+        shard.count("messages_unverified", losses.messages_unverified)
+        shard.warn(f"{losses.messages_unverified:,} messages carry no checksum: damage in them cannot be noticed")
 
 
 def topic_rows(walk: KeyframeWalk, roles: Roles, reader: LogReader) -> list[Row]:

@@ -42,6 +42,8 @@ _MEMORY_NANOS = 20_000_000_000
 _PATIENCE_NANOS = 3_000_000_000
 """A keyframe waits no longer for data about its moment, in log time."""
 _MAX_WARNINGS = 100
+_LAST_NANOS = 2**63 - 2**50
+"""Latest time taken for one; arithmetic on stamps stays within int64."""
 
 Row = dict[str, Any]
 
@@ -122,6 +124,9 @@ class KeyframeWalk:
 
     def _take(self, raw: RawMessage) -> None:
         tally = self.topics.setdefault(raw.channel, TopicTally())
+        if raw.log_time > _LAST_NANOS:
+            tally.skip(f"log time {raw.log_time} ns lies beyond the year 2262")
+            return
         tally.see(raw.log_time)
         self._now = max(self._now, raw.log_time)
         decode = self._decoder(raw.channel, tally)
@@ -148,7 +153,7 @@ class KeyframeWalk:
             self._use_transforms(channel, message, log_time)
             return
         role = self._role_of[channel]
-        stamp = self.clock.stamp(channel.topic, message.stamp_nanos, log_time)
+        stamp = self._stamp(channel, message.stamp_nanos, log_time)
         if isinstance(message, Image | CompressedImage):
             self._candidates.extend(self._pairs.push(role, Stamped(stamp, log_time, message)))
             self._count_unpaired()
@@ -162,10 +167,15 @@ class KeyframeWalk:
         elif isinstance(message, CameraInfo):
             self._infos[role] = message
 
+    def _stamp(self, channel: Channel, stamp_nanos: int, log_time: int) -> int:
+        if not 0 <= stamp_nanos <= _LAST_NANOS:
+            raise SemslamError(f"stamp of {stamp_nanos} ns is no time")
+        return self.clock.stamp(channel.topic, stamp_nanos, log_time)
+
     def _use_transforms(self, channel: Channel, message: Transforms, log_time: int) -> None:
         static = "static" in channel.topic
         for t in message.transforms:
-            stamp = self.clock.stamp(channel.topic, t.stamp_nanos, log_time)
+            stamp = self._stamp(channel, t.stamp_nanos, log_time)
             self._tree.add(t.parent, t.child, stamp, t.translation, t.orientation, static)
 
     def _count_unpaired(self) -> None:

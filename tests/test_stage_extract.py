@@ -1,0 +1,216 @@
+"""Extract puts objects where they stand in the room, and lets every cell be traced to a detection."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from semslam.geometry import rle
+from semslam.geometry.frames import SE2
+from semslam.geometry.grid import to_dense
+from semslam.labels import FIRST_OBJECT, FREE_FLOOR, OBSTACLE, UNOBSERVED
+from semslam.pipeline.job import Outcome
+from semslam.sim.render import Renderer, visible_boxes
+from semslam.sim.toyroom import CLASSES
+from semslam.stages.catalogue import EXTRACT, INGEST
+from semslam.stages.settings import ExtractConfig, IngestConfig
+from semslam.tables.spec import DETECTIONS, OBSERVATIONS
+from tests.make_log import ToyTruth, make_log
+from tests.onnx_factory import constant_detector, dense
+from tests.stage_room import Done, run_stage, try_stage
+
+SIZE = (160, 120)
+NAMES = {"names": str(dict(enumerate(CLASSES)))}
+
+
+def first_view_boxes(truth: ToyTruth) -> list[Any]:
+    """The true boxes of the first keyframe, largest first."""
+    x, y, heading = truth.poses[0]
+    room_from_base = np.eye(4)
+    cosine, sine = math.cos(heading), math.sin(heading)
+    room_from_base[:2, :2] = [[cosine, -sine], [sine, cosine]]
+    room_from_base[:2, 3] = x, y
+    view = Renderer(truth.room).view(truth.colour_camera, room_from_base @ truth.base_from_camera)
+    return sorted(visible_boxes(view, min_pixels=150), key=lambda box: -box.pixels)
+
+
+def oracle(path: Path, boxes: list[Any], extra: Mapping[int, list[float]] | None = None) -> Path:
+    """A YOLOv8-shaped network that answers every picture with these boxes."""
+    width, height = SIZE
+    rows = dict(extra or {})
+    for index, box in enumerate(boxes):
+        scores = [0.0] * len(CLASSES)
+        scores[box.class_id] = 0.9 - 0.01 * index
+        centre = [(box.left + box.right) / 2, (box.top + box.bottom) / 2]
+        rows[index] = [*centre, box.right - box.left, box.bottom - box.top, *scores]
+    columns = dense(84, 4 + len(CLASSES), rows).transpose(0, 2, 1).copy()
+    return constant_detector(path, {"output0": columns}, input_shape=(1, 3, height, width), metadata=NAMES)
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> tuple[ToyTruth, Done, list[Any], Path]:
+    """One keyframe of a toy room, ingested, with a detector that knows the truth about it."""
+    folder = tmp_path_factory.mktemp("extract")
+    truth = make_log(folder / "toy.mcap", frames=1, seed=3, size=SIZE, noise=False)
+    boxes = first_view_boxes(truth)
+    assert boxes
+    frames = run_stage(folder, INGEST, IngestConfig(), sources=[truth.path])
+    return truth, frames, boxes, oracle(folder / "oracle.onnx", boxes)
+
+
+def extract(folder: Path, frames: Done, detector: Path, **settings: Any) -> Done:
+    return run_stage(folder, EXTRACT, ExtractConfig(detector=str(detector), **settings), inputs=[frames])
+
+
+def refused(folder: Path, frames: Done, **settings: Any) -> Outcome:
+    outcome = try_stage(folder, EXTRACT, ExtractConfig(**settings), inputs=[frames])
+    assert outcome.failure is not None
+    return outcome
+
+
+def planes_of(done: Done) -> np.ndarray:
+    meta = done.table(OBSERVATIONS).meta
+    row = done.rows(OBSERVATIONS)[0]
+    return to_dense(
+        np.array(row["cells"], np.uint32),
+        np.array(row["weights"], np.float32),
+        (len(meta["classes"]), meta["side"], meta["side"]),
+    )
+
+
+def test_objects_stand_where_they_are(toy: tuple[ToyTruth, Done, list[Any], Path], tmp_path: Path) -> None:
+    """The cells of a class lie on the footprints of that class, to a few cells, if nothing stands before the objects."""
+    truth, frames, boxes, _ = toy
+    boxes = [box for box in boxes if box.pixels > 0.5 * (box.right - box.left) * (box.bottom - box.top)]
+    assert boxes
+    detector = oracle(tmp_path / "clear.onnx", boxes)
+    done = extract(tmp_path, frames, detector)
+    planes, meta = planes_of(done), done.table(OBSERVATIONS).meta
+    base = SE2(*truth.poses[0])
+    for class_id in {box.class_id for box in boxes}:
+        plane = planes[meta["classes"].index(CLASSES[class_id])]
+        iy, ix = np.nonzero(plane > 0.002)
+        assert len(ix) > 0, CLASSES[class_id]
+        seen = (np.stack([ix, iy], 1) - meta["side"] // 2) * meta["cell_m"]
+        in_room = base.apply(seen)
+        footprints = [thing for thing in truth.objects if thing.class_name == CLASSES[class_id]]
+        away = np.min([distance_to(thing, in_room) for thing in footprints], axis=0)
+        weight = plane[iy, ix] / plane[iy, ix].sum()
+        assert (weight * (away < 0.25)).sum() > 0.8, CLASSES[class_id]
+
+
+def distance_to(thing: Any, points: np.ndarray) -> np.ndarray:
+    """Distance of points (N, 2) to an object's footprint, metres."""
+    local = SE2(thing.x_m, thing.y_m, thing.yaw_rad).inverse().apply(points)
+    beyond = np.maximum(np.abs(local) - np.array([thing.depth_m, thing.width_m]) / 2, 0)
+    return np.asarray(np.hypot(beyond[:, 0], beyond[:, 1]))
+
+
+def test_floor_walls_and_the_unseen(toy: tuple[ToyTruth, Done, list[Any], Path], tmp_path: Path) -> None:
+    """Free floor lies inside the room, walls at its border, and behind them nothing was seen."""
+    truth, frames, _, detector = toy
+    planes = planes_of(extract(tmp_path, frames, detector))
+    centre = planes.shape[1] // 2
+    base = SE2(*truth.poses[0])
+    iy, ix = np.nonzero(planes[FREE_FLOOR])
+    assert len(ix) > 50
+    in_room = base.apply((np.stack([ix, iy], 1) - centre) * 0.1)
+    half = np.array([truth.room.width_m, truth.room.depth_m]) / 2
+    assert (np.abs(in_room) < half + 0.1).all(axis=1).mean() > 0.97
+    assert planes[OBSTACLE].sum() > 10
+    iy, ix = np.indices(planes.shape[1:]).reshape(2, -1)
+    beyond = (np.abs(base.apply((np.stack([ix, iy], 1) - centre) * 0.1)) > half + 0.3).any(axis=1)
+    assert planes[UNOBSERVED].ravel()[beyond].mean() > 0.98
+    assert planes[UNOBSERVED][:, : centre - 3].all()  # behind the camera
+
+
+def test_a_cell_can_be_traced_to_a_detection(toy: tuple[ToyTruth, Done, list[Any], Path], tmp_path: Path) -> None:
+    """Each detection keeps box, score, names, mask and 3D extent."""
+    _, frames, boxes, detector = toy
+    rows = extract(tmp_path, frames, detector).rows(DETECTIONS)
+    assert len(rows) == len(boxes)
+    assert [row["score"] for row in rows] == sorted((row["score"] for row in rows), reverse=True)
+    for row, box in zip(rows, boxes, strict=True):
+        assert (row["label"], row["source_label"]) == (CLASSES[box.class_id],) * 2
+        assert (row["x0_px"], row["y1_px"]) == pytest.approx((box.left, box.bottom), abs=1)
+        mask = rle.decode(row["mask_runs"], SIZE[1], SIZE[0])
+        assert mask.sum() == row["mask_pixels"] > 0
+        assert row["min_z_m"] < row["max_z_m"] < 2.7
+        assert row["min_z_m"] > -0.2
+
+
+def test_select_exclude_remap(toy: tuple[ToyTruth, Done, list[Any], Path], tmp_path: Path) -> None:
+    """Classes can be dropped, renamed and merged; the class list tells."""
+    _, frames, boxes, detector = toy
+    name = CLASSES[boxes[0].class_id]
+    only = extract(tmp_path / "a", frames, detector, select=(name,))
+    assert only.table(OBSERVATIONS).meta["classes"][FIRST_OBJECT:] == [name]
+    assert {row["label"] for row in only.rows(DETECTIONS)} == {name}
+    without = extract(tmp_path / "b", frames, detector, exclude=(name,))
+    assert name not in without.table(OBSERVATIONS).meta["classes"]
+    merged = extract(tmp_path / "c", frames, detector, remap=dict.fromkeys(CLASSES, "thing"))
+    assert merged.table(OBSERVATIONS).meta["classes"][FIRST_OBJECT:] == ["thing"]
+    assert {row["source_label"] for row in merged.rows(DETECTIONS)} == {CLASSES[box.class_id] for box in boxes}
+
+
+def test_impossible_boxes_are_counted(toy: tuple[ToyTruth, Done, list[Any], Path], tmp_path: Path) -> None:
+    """NaN from a model drops that candidate, and says how many."""
+    _, frames, boxes, _ = toy
+    broken = oracle(tmp_path / "nan.onnx", boxes, {80: [math.nan, 1, 1, 1, *[0.9] * len(CLASSES)]})
+    done = extract(tmp_path, frames, broken)
+    assert len(done.rows(DETECTIONS)) == len(boxes)
+    assert done.manifest["counters"]["boxes_impossible"] == 1
+
+
+def test_no_objects_is_a_result(toy: tuple[ToyTruth, Done, list[Any], Path], tmp_path: Path) -> None:
+    """A detector that finds nothing leaves floor and walls."""
+    _, frames, _, _ = toy
+    done = extract(tmp_path, frames, oracle(tmp_path / "blind.onnx", []))
+    assert done.rows(DETECTIONS) == []
+    assert done.rows(OBSERVATIONS)[0]["objects"] == 0
+    assert planes_of(done)[FREE_FLOOR].sum() > 50
+    assert done.manifest["counters"]["frames_without_objects"] == 1
+
+
+def test_what_is_wrong_is_said(toy: tuple[ToyTruth, Done, list[Any], Path], tmp_path: Path) -> None:
+    """No detector, an even side, an unknown class: one sentence and something to type."""
+    _, frames, _, detector = toy
+    none = refused(tmp_path, frames).failure
+    assert none is not None
+    assert "--detector" in none.hint
+    even = refused(tmp_path, frames, detector=str(detector), side=98).failure
+    assert even is not None
+    assert "extract.side=99" in even.hint
+    typo = refused(tmp_path, frames, detector=str(detector), exclude=("chairr",)).failure
+    assert typo is not None
+    assert "`chair`" in typo.hint
+
+
+def test_resumed_extract_gives_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped after a shard and run again: same tables, and finished keyframes are not looked at again."""
+    truth = make_log(tmp_path / "toy.mcap", frames=5, size=SIZE)
+    frames = run_stage(tmp_path, INGEST, IngestConfig(), sources=[truth.path])
+    detector = oracle(tmp_path / "oracle.onnx", first_view_boxes(truth)[:2])
+    whole = extract(tmp_path / "whole", frames, detector, shard_frames=2)
+    from semslam.stages import extract as stage
+
+    real, looks = stage.look, []
+
+    def counting(*args: Any) -> Any:
+        looks.append(1)
+        if len(looks) == 4:
+            raise RuntimeError("stopped by the test")
+        return real(*args)
+
+    monkeypatch.setattr(stage, "look", counting)
+    config = ExtractConfig(detector=str(detector), shard_frames=2)
+    assert try_stage(tmp_path / "stopped", EXTRACT, config, inputs=[frames]).failure is not None
+    resumed = extract(tmp_path / "stopped", frames, detector, shard_frames=2)
+    assert resumed.outcome.resumed == 1
+    assert len(looks) == 4 + 3
+    assert resumed.digests == whole.digests
