@@ -84,7 +84,7 @@ def planes_of(done: Done) -> np.ndarray:
 
 
 def test_objects_stand_where_they_are(toy: tuple[ToyTruth, Done, list[Any], Path], tmp_path: Path) -> None:
-    """The cells of a class lie on the footprints of that class, to a few cells, if nothing stands before the objects."""
+    """The cells of a class lie on the footprints of that class, to a few cells, where nothing stands before them."""
     truth, frames, boxes, _ = toy
     boxes = [box for box in boxes if box.pixels > 0.5 * (box.right - box.left) * (box.bottom - box.top)]
     assert boxes

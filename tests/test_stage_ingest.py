@@ -106,10 +106,10 @@ def test_depth_is_registered_to_colour(tmp_path: Path, depth: str) -> None:
     )
     assert (found > 0).mean() > 0.9 * (wanted > 0).mean()
     around = np.ones((7, 7), np.uint8)
-    smooth = cv2.dilate(wanted, around) - cv2.erode(wanted, around) < 0.25  # away from outlines, where views differ
+    smooth = cv2.dilate(wanted, around) - cv2.erode(wanted, around) < 0.1  # away from outlines, where views differ
     error = np.abs(found - wanted)[smooth & (found > 0) & (wanted > 0)]
     assert error.size > 1000
-    assert np.percentile(error, 95) < 0.01
+    assert np.percentile(error, 99) < 0.01
 
 
 def test_raw_colour_becomes_png_without_loss(tmp_path: Path) -> None:

@@ -165,5 +165,5 @@ class ExportConfig:
     """Pixels of the map picture a cell; 0 chooses a picture of about 1000 pixels."""
     occupied_threshold: float = setting(0.65, low=0.0, high=1.0)
     """occupied_thresh of the map_server file."""
-    free_threshold: float = setting(0.25, low=0.0, high=1.0)
-    """free_thresh of the map_server file."""
+    free_threshold: float = setting(0.196, low=0.0, high=1.0)
+    """free_thresh of the map_server file; 0.196 is what it reads for the grey of unknown cells."""
