@@ -6,4 +6,4 @@ import os
 
 from semslam.pipeline.threads import ONE_THREAD
 
-os.environ.update(ONE_THREAD)
+os.environ.update(ONE_THREAD, ORT_DISABLE_TELEMETRY="1")

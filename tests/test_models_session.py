@@ -14,7 +14,7 @@ from onnx import helper
 
 from semslam.errors import SemslamError
 from semslam.models.session import open_session
-from tests.onnx_factory import constant_detector, save, value
+from tests.onnx_factory import constant_detector, dense, save, value
 
 
 def _plain(path: Path, **options: object) -> Path:
@@ -89,3 +89,15 @@ def test_opening_a_chatty_model_prints_nothing() -> None:
     model = str(Path(DATA) / "models/nanodet_m_320.onnx")
     done = subprocess.run([sys.executable, "-c", code, model], capture_output=True, text=True, check=True)
     assert done.stdout + done.stderr == ""
+
+
+def test_nothing_is_reported_to_anybody(tmp_path: Path) -> None:
+    """Opening and running a model leaves no trace in the home folder, where onnxruntime would queue its telemetry."""
+    model = constant_detector(tmp_path / "m.onnx", {"o": dense(84, 7, {})}, metadata={"names": "['cup', 'chair']"})
+    home = tmp_path / "home"
+    home.mkdir()
+    silent = {"ORT_DISABLE_TELEMETRY", "ORT_RUNNING_UNIT_TESTS", "CI"} | {n for n in os.environ if n.startswith("XDG_")}
+    environment = {name: value for name, value in os.environ.items() if name not in silent} | {"HOME": str(home)}
+    code = f"from semslam.models.inspect import describe; from pathlib import Path; describe(Path({str(model)!r}))"
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+    assert list(home.rglob("*")) == []
