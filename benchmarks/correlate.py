@@ -15,8 +15,6 @@ import os
 os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 import argparse
-import datetime
-import platform
 import statistics
 import time
 from collections.abc import Callable
@@ -24,6 +22,7 @@ from collections.abc import Callable
 import numpy as np
 import onnx
 import onnxruntime
+from machine import machine
 
 from semslam.geometry.frames import SE2
 from semslam.geometry.grid import Planes, pool_observation
@@ -43,8 +42,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="three rounds, to exercise the code")
     rounds = 3 if parser.parse_args().quick else 40
-    print(f"{platform.machine()}, {os.cpu_count()} cores, {_processor()}, Python {platform.python_version()}")
-    print(f"numpy {np.__version__}, onnxruntime {onnxruntime.__version__}, {datetime.date.today().isoformat()}")
+    print(machine("numpy", "onnxruntime"))
     sizes = f"L = {len(CLASSES) - FIRST_OBJECT} object classes, h = {PAPER.side}, R = {PAPER.headings}"
     print(f"{rounds} rounds, median; {sizes}")
     print(f"{'case':6} {'convolution':>14} {'correlate':>14} {'whole step':>14}   ratio to the convolution")
@@ -119,15 +117,6 @@ def _convolution() -> Callable[[Planes, Planes], Planes]:
         return result
 
     return convolve
-
-
-def _processor() -> str:
-    """The processor's name, where the system tells it."""
-    try:
-        with open("/proc/cpuinfo", encoding="ascii", errors="replace") as lines:
-            return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or "unknown processor"
 
 
 if __name__ == "__main__":

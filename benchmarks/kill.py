@@ -10,9 +10,6 @@ compared: every file of the cache but timing.json, and every file of the results
 from __future__ import annotations
 
 import argparse
-import datetime
-import os
-import platform
 import random
 import shutil
 import subprocess
@@ -22,7 +19,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import semslam
+from machine import machine
+
 from semslam.pipeline.digest import sha256_file
 from semslam.pipeline.files import files_below
 
@@ -79,8 +77,7 @@ def main() -> None:
         root = Path(temporary)
         undisturbed_s = finish(root / "undisturbed", options.arguments)
         expected = digests(root / "undisturbed")
-        machine = f"{platform.machine()}, {os.cpu_count()} CPUs"
-        print(f"semslam {semslam.__version__}, Python {platform.python_version()}, {machine}, {datetime.date.today()}")
+        print(machine())
         print(f"undisturbed run: {undisturbed_s:.1f} s, {len(expected)} files")
         equal = killed = resumed = 0
         after_s = []

@@ -10,9 +10,7 @@ with nothing to do, and starting Python to stat every file that the decision dep
 from __future__ import annotations
 
 import argparse
-import datetime
 import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -22,7 +20,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import semslam
+from machine import machine
+
 from semslam.pipeline.config import load_config
 from semslam.pipeline.console import Console, RunView
 from semslam.pipeline.discover import discover
@@ -96,8 +95,7 @@ def main() -> None:
         decided = seconds(command, times)
         start = seconds([sys.executable, "-c", "pass"], times)
         stats = seconds([sys.executable, "-c", _STAT_ALL, str(root / "watched.txt")], times)
-    machine = f"{platform.machine()}, {os.cpu_count()} CPUs"
-    print(f"semslam {semslam.__version__}, Python {platform.python_version()}, {machine}, {datetime.date.today()}")
+    print(machine())
     print(f"median of {times}")
     print(f"{number} logs, {len(manifests)} entries, {len(watched)} files that matter")
     print(f"nothing to do         {decided:6.3f} s")

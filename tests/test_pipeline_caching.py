@@ -266,3 +266,11 @@ def test_a_log_that_changes_while_it_is_read_is_not_published(world: World, monk
     assert states(world.run(until="first"))["kitchen first"] == "failed"
     monkeypatch.undo()
     assert states(world.run(until="first"))["kitchen first"] == "done"
+
+
+def test_variants_with_equal_results_stay_apart(world: World) -> None:
+    """A stage may show the name of its variant, so an equal input is not enough to share its result."""
+    make_log(world.logs, numbers=[0, 0])
+    world.run()
+    texts = {path.parent.name: path.read_text() for path in world.out.glob("results/kitchen/*/map.png")}
+    assert texts == {name: f"map kitchen {name} [0, 0]" for name in ("careful", "hasty", "lazy")}

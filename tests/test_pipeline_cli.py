@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import pty
+import re
+import struct
 import subprocess
 import sys
+import termios
 from pathlib import Path
 
 import click
@@ -16,7 +21,7 @@ from semslam.pipeline.cli import cli, run_command
 from semslam.pipeline.folder import open_folder
 from semslam.stages.contract import StageContext
 from tests import fake_stages
-from tests.fake_stages import SUMS, make_log
+from tests.fake_stages import SUMS, command_line, make_log
 from tests.pipeline_helpers import World
 
 pytest_plugins = ("tests.pipeline_fixtures",)
@@ -392,3 +397,47 @@ def test_split_recordings_are_announced(world: World, capsys: Capture) -> None:
     assert world.invoke("run", world.logs, "--out", world.out, "--workers", 0) == 0
     assert "`home` is a recording in 2 files" in capsys.readouterr().err
     assert (world.out / "results" / "home" / "hasty" / "map.png").read_text() == "map home hasty [2, 8, 20, 40]"
+
+
+def test_options_of_their_own_stand_for_settings(
+    world: World, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Topics, models and estimators end up in the configuration."""
+    monkeypatch.chdir(world.root)
+    arguments = ["--topic", "depth=/d", "--topic", "imu=/i", "--detector", "yolo.onnx", "--estimator", "paper"]
+    assert run_command(["config", "show", *arguments], None) == 0
+    shown = capsys.readouterr().out
+    assert 'topics = { depth = "/d", imu = "/i" }\n' in shown
+    assert f'detector = "{world.root}/yolo.onnx"\n' in shown
+    assert 'estimators = ["paper"]\n' in shown
+
+
+def on_a_terminal(world: World, **environment: str) -> str:
+    """What a run writes to a terminal of 100 columns."""
+    parent, child = pty.openpty()
+    fcntl.ioctl(child, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 100, 0, 0))
+    arguments = ["run", world.logs, "--out", world.out, "--workers", 1, "--set", "first.pause_s=0.1"]
+    process = subprocess.Popen(
+        command_line(arguments), stdout=child, stderr=child, cwd=world.root, env={**os.environ, **environment}
+    )
+    os.close(child)
+    shown = b""
+    while True:
+        try:
+            shown += os.read(parent, 1 << 16)
+        except OSError:  # Linux says EIO when the last writer is gone
+            break
+    os.close(parent)
+    assert process.wait() == 0
+    return shown.decode()
+
+
+def test_bars_and_colours_on_a_terminal(world: World) -> None:
+    """Rate and time left while it runs; gone at the end, where the table stands. NO_COLOR is respected."""
+    make_log(world.logs, orders="warn", numbers=range(8))
+    shown = on_a_terminal(world)
+    assert re.search(r"kitchen first: +\d+%.*4/8 \[.* line/s\]", shown)
+    assert re.search(r"all tasks: +\d+%", shown)
+    assert "\033[33mwarning:\033[0m" in shown
+    make_log(world.logs, orders="warn", numbers=range(3))
+    assert "\033[33m" not in on_a_terminal(world, NO_COLOR="1")

@@ -12,6 +12,7 @@ import difflib
 import inspect
 import math
 import os
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
@@ -341,11 +342,15 @@ def _toml_value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, Mapping):
-        inner = ", ".join(f"{_toml_text(key)} = {_toml_value(item)}" for key, item in value.items())
+        inner = ", ".join(f"{_toml_key(key)} = {_toml_value(item)}" for key, item in value.items())
         return f"{{ {inner} }}" if inner else "{}"
     if isinstance(value, (tuple, list)):
         return f"[{', '.join(_toml_value(item) for item in value)}]"
     return repr(value) if isinstance(value, (int, float)) else _toml_text(str(value))
+
+
+def _toml_key(key: str) -> str:
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _toml_text(key)
 
 
 def _toml_text(text: str) -> str:

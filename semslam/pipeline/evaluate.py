@@ -84,8 +84,9 @@ def evaluate_run(folder: OutputFolder) -> Evaluation:
 def _score_log(
     folder: OutputFolder, index: EntryIndex, record: LogRecord, truth: Track, notes: list[str]
 ) -> Iterator[Line]:
-    names = [task.partition("/")[2] for task in record.tasks if task.split("/")[0] == POSES.stage]
-    for estimator in names:
+    known = [task.partition("/")[2] for task in record.tasks if task.split("/")[0] == POSES.stage]
+    order: list[str] = record.config[POSES.stage]["estimators"]
+    for estimator in sorted(known, key=lambda name: order.index(name) if name in order else len(order)):
         track = _track(folder, index, record, POSES, estimator)
         if track is None:
             notes.append(f"`{record.name}` has no poses of `{estimator}`")

@@ -9,10 +9,13 @@
       cache/<stage>/.work-<key>/   the finished shards of an unfinished entry
       cache/digests.json           digests of input files, by path and stamp
       cache/index.json             what planning needs of every entry, by the stamp of its manifest
+      cache/results.json           which entry each folder of results was copied from, and the stamps of the copies
       results/<log>/<variant>/     the files of the last stage under stable names
+      results/evaluation.parquet   what `semslam evaluate` wrote last
+      .lock                        held by the run that works here, with its process id
 
-Everything under `cache` but the two memories is published by renaming a finished folder and never changed afterwards.
-Both memories may be deleted at any time; they only save reading.
+Everything under `cache` but its three `.json` files is published by renaming a finished folder and never changed
+afterwards. Those three are memories that only save reading, and may be deleted at any time.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """A run: decide every task, hand out what has to run, keep what came of it.
 
 The loop is driven by one thread. Tasks are decided as soon as those before them are settled; tasks of different logs
-that turn out to be the same work (equal keys) run once. One failed task blocks those that need it and nothing else.
+that turn out to be the same work (equal keys) run once. One failed task blocks those that need it and nothing else; it
+is tried again by every run, because a cause outside the key (memory, a missing library) may be gone.
 """
 
 from __future__ import annotations

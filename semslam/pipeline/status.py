@@ -94,7 +94,8 @@ class Status:
                 yield f"{len(lines) - MAX_LINES} more: see `semslam status {self.out} --json`"
 
     def _last_line(self) -> str:
-        line = f"{len(self.logs)} logs, cache {bytes_text(self.cache_bytes)}"
+        count = f"{len(self.logs)} {'log' if len(self.logs) == 1 else 'logs'}"
+        line = f"{count}, cache {bytes_text(self.cache_bytes)}"
         return line + (f", {self.unfinished} unfinished" if self.unfinished else "")
 
 

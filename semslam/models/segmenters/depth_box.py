@@ -2,7 +2,7 @@
 
 Seeds: pixels close to the box's main depth are probably object, those in the middle of it surely; pixels outside the
 box and far behind it are background. Colour then decides along the outline (Rother, Kolmogorov, Blake 2004). Works on a
-crop of at most 120 pixels a side, so that its cost does not depend on the camera.
+crop of at most 112 pixels a side, so that its cost does not depend on the camera.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class DepthBoxSegmenter:
     """Pixels within this distance of the main depth may be object."""
     core_m: float = 0.12
     """Pixels this close to it, in the middle of the box, surely are."""
-    side: int = 120
+    side: int = 112
     """Longest side of the crop that GrabCut works on, pixels."""
-    rounds: int = 2
+    rounds: int = 1
 
     def __call__(
         self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], boxes: NDArray[np.float32]
