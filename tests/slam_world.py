@@ -121,6 +121,9 @@ class MemoryShard:
     def note(self, key: str, value: Any) -> None:
         self.notes[key] = value
 
+    def remark(self, message: str) -> None:
+        pass
+
     def warn(self, message: str) -> None:
         self.warnings.append(message)
 

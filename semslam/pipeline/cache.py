@@ -78,6 +78,7 @@ class Entry:
     files: Mapping[str, str]
     counters: Mapping[str, int]
     warnings: tuple[str, ...]
+    remarks: tuple[str, ...]
 
     @classmethod
     def of(cls, manifest: Mapping[str, Any]) -> Entry:
@@ -91,16 +92,17 @@ class Entry:
             {Path(file["file"]).name: file["sha256"] for file in manifest["files"]},
             manifest["counters"],
             tuple(manifest["warnings"]),
+            tuple(manifest["remarks"]),
         )
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Entry:
         """The summary as `as_json` gave it."""
-        return cls(**{**value, "warnings": tuple(value["warnings"])})
+        return cls(**{**value, "warnings": tuple(value["warnings"]), "remarks": tuple(value["remarks"])})
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        return {**self.__dict__, "warnings": list(self.warnings)}
+        return {**self.__dict__, "warnings": list(self.warnings), "remarks": list(self.remarks)}
 
 
 class EntryIndex:
@@ -336,7 +338,6 @@ def build_manifest(
     provenance: Mapping[str, str],
 ) -> dict[str, Any]:
     """The manifest of an entry out of its shards; the same shards give the same manifest at any time."""
-    warnings = [warning for shard in shards for warning in shard["warnings"]]
     counters: dict[str, int] = {}
     for shard in shards:
         for name, number in shard["counters"].items():
@@ -353,9 +354,15 @@ def build_manifest(
         "files": [_placed(index, file) for index, shard in enumerate(shards) for file in _sorted_files(shard)],
         "shards": len(shards),
         "counters": counters,
-        "warnings": warnings,
+        "warnings": _once(shards, "warnings"),
+        "remarks": _once(shards, "remarks"),
         "provenance": dict(provenance),
     }
+
+
+def _once(shards: Sequence[Mapping[str, Any]], kind: str) -> list[str]:
+    """Sentences of all shards, each once."""
+    return list(dict.fromkeys(sentence for shard in shards for sentence in shard[kind]))
 
 
 def _tables(shards: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

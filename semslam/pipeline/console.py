@@ -201,8 +201,16 @@ def bytes_text(number: int) -> str:
 
 
 def say_end(console: Console, report: RunReport, out: str, places: Sequence[str], stale: Sequence[str]) -> None:
-    """The last lines of a run: warnings, failures, and where the results lie; `stale` are folders with older ones."""
+    """The last lines of a run: how input was understood, warnings, failures, and where the results lie.
+
+    `stale` are folders with older results.
+    """
     new = [r for r in report.results if r.state == "done"]
+    remarks = [f"`{r.task.log.name}` {r.task.name}: {text}" for r in new if r.entry for text in r.entry.remarks]
+    for text in remarks[:MAX_LINES]:
+        console.say(f"note: {text}")
+    if len(remarks) > MAX_LINES:
+        console.say(f"note: and {len(remarks) - MAX_LINES} more; `--json` lists them")
     warnings = [f"`{r.task.log.name}` {r.task.name}: {text}" for r in new if r.entry for text in r.entry.warnings]
     for text in warnings[:MAX_LINES]:
         console.warn(text)

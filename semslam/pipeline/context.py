@@ -36,6 +36,7 @@ class Shard:
         self._notes: dict[str, Any] = {}
         self._warnings: list[str] = []
         self._more_warnings = 0
+        self._remarks: list[str] = []
         self._counters: dict[str, int] = {}
 
     def table(self, table: Table, meta: Mapping[str, Any] | None = None) -> TableSink:
@@ -77,6 +78,10 @@ class Shard:
         else:
             self._more_warnings += 1
 
+    def remark(self, message: str) -> None:
+        """Keep how the stage understood its input."""
+        self._remarks.append(message)
+
     def count(self, name: str, number: int = 1) -> None:
         """Add to a counter."""
         self._counters[name] = self._counters.get(name, 0) + int(number)
@@ -98,6 +103,7 @@ class Shard:
             "files": {name: self._stored(name) for name in self._files},
             "notes": self._notes,
             "warnings": self._warnings + ([f"{self._more_warnings} more warnings"] if self._more_warnings else []),
+            "remarks": self._remarks,
             "counters": self._counters,
         }
 

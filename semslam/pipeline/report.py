@@ -60,6 +60,7 @@ def task_json(result: TaskResult) -> dict[str, Any]:
         "rows": dict(entry.rows) if entry else {},
         "files": dict(entry.files) if entry else {},
         "counters": dict(entry.counters) if entry else {},
+        "remarks": list(entry.remarks) if entry else [],
         "warnings": list(entry.warnings) if entry else [],
         "failure": result.failure.as_json() if result.failure else None,
         "seconds": round(result.seconds, 3),

@@ -96,6 +96,9 @@ class ShardWriter(Protocol):
     def warn(self, message: str) -> None:
         """Say something the user should know: shown at the end, kept in the manifest."""
 
+    def remark(self, message: str) -> None:
+        """Say how the stage understood its input (which topics, which adapter): shown when it runs, kept likewise."""
+
     def count(self, name: str, number: int = 1) -> None:
         """Add to a counter of the manifest, such as `frames_skipped`; summed over shards."""
 

@@ -46,6 +46,8 @@ def run(ctx: StageContext) -> None:
         if index < len(ctx.finished):
             continue
         with ctx.shard(index) as shard:
+            shard.remark(f"detector read as {detector.name}, {len(classes.of_detector)} classes, {detector.provider}")
+            shard.note("provider", detector.provider)
             detections = shard.table(DETECTIONS, {"classes": classes.all})
             observations = shard.table(OBSERVATIONS, meta)
             for done, frame in enumerate(_frames(frames.batches(None, start, stop, 4), config), start + 1):

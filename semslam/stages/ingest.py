@@ -44,6 +44,7 @@ def run(ctx: StageContext) -> None:
                 pass
         else:
             with ctx.shard(index) as shard:
+                _tell_roles(shard, roles)
                 _write(ctx, shard, islice(keyframes, config.shard_frames), "truth" in roles.topics)
                 if keyframes.ended:
                     _close(shard, walk, roles, reader)
@@ -67,6 +68,11 @@ def needed_roles(log: str, seen: Sequence[TopicSeen], overrides: Mapping[str, st
                 f"No {what} topic in `{log}`", details=details, hint=f"name the topic with `--topic {role}=/...`"
             )
     return roles
+
+
+def _tell_roles(shard: ShardWriter, roles: Roles) -> None:
+    for role, seen in roles.topics.items():
+        shard.remark(f"{role} is `{seen.channel.topic}` ({roles.why[role]})")
 
 
 def _write(ctx: StageContext, shard: ShardWriter, keyframes: Iterator[Keyframe], has_truth: bool) -> None:
