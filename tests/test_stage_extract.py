@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from semslam.errors import SemslamError
 from semslam.geometry import rle
 from semslam.geometry.frames import SE2
 from semslam.geometry.grid import to_dense
@@ -167,6 +168,31 @@ def test_impossible_boxes_are_counted(toy: tuple[ToyTruth, Done, list[Any], Path
     assert done.manifest["counters"]["boxes_impossible"] == 1
 
 
+def test_one_bad_keyframe_does_not_stop_a_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model that fails on one picture costs that picture; one that fails on all is an error."""
+    truth = make_log(tmp_path / "toy.mcap", frames=3, size=SIZE)
+    frames = run_stage(tmp_path, INGEST, IngestConfig(), sources=[truth.path])
+    detector = oracle(tmp_path / "oracle.onnx", first_view_boxes(truth)[:2])
+    from semslam.stages import extract as stage
+
+    real, bad = stage.look, {1}
+
+    def failing(frame: stage.Frame, *rest: Any) -> Any:
+        if frame.row["frame"] in bad:
+            raise SemslamError("the model fails on this picture")
+        return real(frame, *rest)
+
+    monkeypatch.setattr(stage, "look", failing)
+    done = extract(tmp_path / "one", frames, detector)
+    assert [row["frame"] for row in done.rows(OBSERVATIONS)] == [0, 1, 2]
+    assert done.manifest["counters"]["frames_failed"] == 1
+    assert any("keyframe 1 left out" in warning for warning in done.manifest["warnings"])
+    bad |= {0, 2}
+    failure = refused(tmp_path / "all", frames, detector=str(detector)).failure
+    assert failure is not None
+    assert "fails on this picture" in failure.message
+
+
 def test_no_objects_is_a_result(toy: tuple[ToyTruth, Done, list[Any], Path], tmp_path: Path) -> None:
     """A detector that finds nothing leaves floor and walls."""
     _, frames, _, _ = toy
@@ -186,6 +212,9 @@ def test_what_is_wrong_is_said(toy: tuple[ToyTruth, Done, list[Any], Path], tmp_
     even = refused(tmp_path, frames, detector=str(detector), side=98).failure
     assert even is not None
     assert "extract.side=99" in even.hint
+    floor = refused(tmp_path, frames, detector=str(detector), remap={"chair": "free_floor"}).failure
+    assert floor is not None
+    assert "reserved" in floor.hint
     typo = refused(tmp_path, frames, detector=str(detector), exclude=("chairr",)).failure
     assert typo is not None
     assert "`chair`" in typo.hint

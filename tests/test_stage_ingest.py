@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from semslam.geometry.frames import SE2, wrap_angle
+from semslam.geometry.frames import FLU_FROM_OPTICAL, SE2, wrap_angle
 from semslam.logs.decode import decoder_for
-from semslam.logs.messages import CompressedImage
+from semslam.logs.messages import CompressedImage, Imu, Message, Odometry
 from semslam.logs.reader import LogReader
+from semslam.logs.roles import choose_roles, peek
 from semslam.logs.writer import Ros2LogWriter
 from semslam.stages.catalogue import INGEST
 from semslam.stages.contract import ShardWriter, StageContext
@@ -109,7 +111,7 @@ def test_depth_is_registered_to_colour(tmp_path: Path, depth: str) -> None:
     smooth = cv2.dilate(wanted, around) - cv2.erode(wanted, around) < 0.1  # away from outlines, where views differ
     error = np.abs(found - wanted)[smooth & (found > 0) & (wanted > 0)]
     assert error.size > 1000
-    assert np.percentile(error, 99) < 0.01
+    assert np.percentile(error, 99) < 0.02
 
 
 def test_raw_colour_becomes_png_without_loss(tmp_path: Path) -> None:
@@ -195,13 +197,99 @@ def test_nothing_within_tolerance_is_refused(tmp_path: Path) -> None:
 
 def with_late_depth(source: Path, target: Path, delay_nanos: int) -> Path:
     """The same log with depth images stamped later."""
+
+    def delay(topic: str, message: Message, log_time: int) -> tuple[Message, int]:
+        if "depth/image" in topic and isinstance(message, CompressedImage):
+            message = replace(message, stamp_nanos=message.stamp_nanos + delay_nanos)
+        return message, log_time
+
+    return rewritten(source, target, delay)
+
+
+def rewritten(source: Path, target: Path, change: Callable[[str, Message, int], tuple[Message, int] | None]) -> Path:
+    """The same log with every message, and when it was logged, changed or left out."""
     with Ros2LogWriter(target) as writer:
         for raw in LogReader([source]).messages():
-            message = decoder_for(raw.channel)(raw.data)
-            if "depth/image" in raw.channel.topic and isinstance(message, CompressedImage):
-                message = replace(message, stamp_nanos=message.stamp_nanos + delay_nanos)
-            writer.write(raw.channel.topic, message, raw.log_time)
+            changed = change(raw.channel.topic, decoder_for(raw.channel)(raw.data), raw.log_time)
+            if changed is not None:
+                writer.write(raw.channel.topic, *changed)
     return target
+
+
+def test_static_transforms_logged_late_still_count(tmp_path: Path) -> None:
+    """A recorder that writes tf_static after some seconds has the same rig from the first keyframe on."""
+    truth = make_log(tmp_path / "toy.mcap", frames=5, depth_camera_offset=(0.0, 0.03, 0.0))
+    late = rewritten(
+        truth.path, tmp_path / "late.mcap", lambda topic, m, t: (m, t + 3_500_000_000 if topic == "/tf_static" else t)
+    )
+    there = ingest(tmp_path / "in_time", truth).rows(FRAMES)
+    found = run_stage(tmp_path / "late", INGEST, IngestConfig(), sources=[late]).rows(FRAMES)
+    assert [row["robot_from_camera"] for row in found] == [row["robot_from_camera"] for row in there]
+    assert [row["depth"] for row in found] == [row["depth"] for row in there]
+
+
+def test_odometry_that_cannot_be_used_is_told(tmp_path: Path) -> None:
+    """Quaternions of zeros are no poses: the IMU speaks instead, and a warning says why."""
+    truth = make_log(tmp_path / "toy.mcap", frames=3)
+
+    def spoil(_topic: str, message: Message, log_time: int) -> tuple[Message, int]:
+        return (replace(message, orientation=(0.0,) * 4) if isinstance(message, Odometry) else message), log_time
+
+    done = run_stage(tmp_path, INGEST, IngestConfig(), sources=[rewritten(truth.path, tmp_path / "zero.mcap", spoil)])
+    assert [row["source"] for row in done.rows(MOTION)] == ["start", "imu", "imu"]
+    assert any("messages of `/odom` cannot be used" in warning for warning in done.manifest["warnings"])
+
+
+def test_what_a_map_lacks_is_told(tmp_path: Path) -> None:
+    """No levelling and no motion are said in so many words, not left for the map to show."""
+    truth = make_log(tmp_path / "toy.mcap", frames=3, tf=False, imu=False, odometry=False)
+    warnings = " / ".join(ingest(tmp_path, truth).manifest["warnings"])
+    assert "3 of 3 keyframes are not levelled" in warnings
+    assert "no motion for 2 of 3 keyframes" in warnings
+
+
+def test_truth_of_another_frame(tmp_path: Path) -> None:
+    """`truth_frame` says whose pose the truth topic tells; the robot's follows from tf."""
+    truth = make_log(tmp_path / "toy.mcap", frames=2, noise=False)
+    plain = ingest(tmp_path / "a", truth).rows(TRUTH)
+    moved = ingest(tmp_path / "b", truth, IngestConfig(truth_frame="camera_link")).rows(TRUTH)
+    link_from_base = np.linalg.inv(truth.base_from_camera @ np.linalg.inv(FLU_FROM_OPTICAL))
+    for one, other in zip(plain, moved, strict=True):
+        away = SE2(one["x_m"], one["y_m"], one["heading_rad"]).between(SE2(other["x_m"], other["y_m"], 0.0))
+        assert (away.x_m, away.y_m, other["z_m"] - one["z_m"]) == pytest.approx(link_from_base[:3, 3], abs=1e-6)
+
+
+def test_hours_without_a_picture_take_no_memory(tmp_path: Path) -> None:
+    """A camera that died leaves the IMU running: what it says is not kept for ever."""
+    truth = make_log(tmp_path / "toy.mcap", frames=2)
+    last = truth.stamps_nanos[-1] + 1_000_000_000
+    long = tmp_path / "long.mcap"
+    with Ros2LogWriter(long) as writer:
+        for raw in LogReader([truth.path]).messages():
+            writer.write(raw.channel.topic, decoder_for(raw.channel)(raw.data), raw.log_time)
+        for i in range(12_000):
+            stamp = last + i * 10_000_000
+            writer.write("/imu/data_raw", Imu(stamp, "imu_link", (0.0, 0.0, 0.0), (0.0, 0.0, 9.81), None), stamp)
+    reader = LogReader([long])
+    walk = KeyframeWalk(reader, choose_roles(peek(reader), {}), IngestConfig(), {})
+    assert len(list(walk.keyframes())) == 2
+    assert len(walk._imu._samples) < 4_000
+
+
+def test_orientation_of_a_jpeg_does_not_turn_it(tmp_path: Path) -> None:
+    """EXIF may ask to turn a picture; depth and intrinsics know nothing of that, so its pixels stay where they are."""
+    truth = make_log(tmp_path / "toy.mcap", frames=1)
+    exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"
+    segment = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
+
+    def turn(_topic: str, message: Message, log_time: int) -> tuple[Message, int]:
+        if isinstance(message, CompressedImage) and message.data[:2] == b"\xff\xd8":
+            message = replace(message, data=message.data[:2] + segment + message.data[2:])
+        return message, log_time
+
+    done = run_stage(tmp_path, INGEST, IngestConfig(), sources=[rewritten(truth.path, tmp_path / "turned.mcap", turn)])
+    plain = decode_colour(ingest(tmp_path / "plain", truth).rows(FRAMES)[0]["colour"])
+    assert (decode_colour(done.rows(FRAMES)[0]["colour"]) == plain).all()
 
 
 def test_resumed_ingest_gives_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -177,6 +177,17 @@ class FrameTree:
         moving = [self._edges[frame].moving.last for frame in path[0] + path[1] if self._edges[frame].static is None]
         return min((stamp for stamp in moving if stamp is not None), default=FOREVER)
 
+    def known_between(self, parent: str, child: str) -> tuple[int, int] | None:
+        """The oldest and newest stamps at which the pair can be looked up; None without a path or without samples."""
+        path = self._path(parent, child)
+        if path is None:
+            return None
+        moving = [self._edges[frame].moving for frame in path[0] + path[1] if self._edges[frame].static is None]
+        ends = [(line.first, line.last) for line in moving if line.first is not None and line.last is not None]
+        if len(ends) < len(moving):
+            return None
+        return max((first for first, _ in ends), default=-FOREVER), min((last for _, last in ends), default=FOREVER)
+
     def root_of(self, frame: str) -> str | None:
         """The topmost frame above `frame`; None if the tree has no such frame."""
         frame = _name(frame)

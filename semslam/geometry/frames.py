@@ -18,8 +18,8 @@ from semslam.errors import SemslamError
 Matrix = NDArray[np.float64]
 """(4, 4) rigid transform, parent_from_child."""
 
-QUATERNION_TOLERANCE = 0.01
-"""Norms this far from 1 are rounding of the sender and are normalised; others are refused, as tf2 does."""
+QUATERNION_TOLERANCE = 0.1
+"""Norms this far from 1 are rounding of the sender and are normalised; others are refused."""
 
 STEEP = 0.995
 """Above this vertical share the body's x axis gives no heading, and its y axis is asked instead (84 degrees)."""

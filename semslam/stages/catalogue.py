@@ -29,6 +29,7 @@ INGEST = Stage(
     entry="semslam.stages.ingest:run",
     from_log=True,
     optional=(TRUTH,),
+    libraries=("numpy", "opencv-contrib-python-headless", "gtsam", "pyarrow"),
 )
 EXTRACT = Stage(
     "extract",
@@ -37,6 +38,7 @@ EXTRACT = Stage(
     reads=(FRAMES,),
     writes=(DETECTIONS, OBSERVATIONS),
     entry="semslam.stages.extract:run",
+    libraries=("numpy", "opencv-contrib-python-headless", "onnxruntime", "pyarrow"),
 )
 LOCALIZE = Stage(
     "localize",
@@ -46,6 +48,7 @@ LOCALIZE = Stage(
     writes=(POSES, SNAPSHOTS, CELLS),
     entry="semslam.stages.localize:run",
     variants="estimators",
+    libraries=("numpy", "pyarrow"),
 )
 EXPORT = Stage(
     "export",
@@ -55,6 +58,7 @@ EXPORT = Stage(
     writes=(TRAJECTORY,),
     entry="semslam.stages.export:run",
     unit="file",
+    libraries=("numpy", "opencv-contrib-python-headless", "pyarrow"),
 )
 
 STAGES: tuple[Stage, ...] = (INGEST, EXTRACT, LOCALIZE, EXPORT)

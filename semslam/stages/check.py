@@ -18,18 +18,22 @@ from numpy.typing import NDArray
 from semslam.errors import SemslamError
 from semslam.geometry.camera import Camera
 from semslam.geometry.frame_tree import FrameTree
+from semslam.geometry.frames import matrix_from_pose
 from semslam.logs.clock import StampClock
 from semslam.logs.decode import decoder_for, kind_of
-from semslam.logs.messages import CameraInfo, CompressedImage, Image, Imu, Message, Transforms
+from semslam.logs.messages import CameraInfo, CompressedImage, Image, Imu, Message, Odometry, Pose, Transforms
 from semslam.logs.pairing import PairBuffer, Stamped
 from semslam.logs.reader import Channel, LogReader, RawMessage
 from semslam.logs.roles import Roles, TopicSeen, choose_roles, frame_of, peek
-from semslam.stages.keyframes import KeyframeWalk, TopicTally
+from semslam.stages.keyframes import KeyframeWalk, TopicTally, static_transforms
 from semslam.stages.settings import IngestConfig
 from semslam.tables.pictures import decode_colour, decode_depth, encode_colour
 
 _STANDARD_GRAVITY = 9.80665
-_IMU_SAMPLES = 20_000
+_SAMPLES = 20_000
+"""So many readings are enough for a median."""
+_TIDY_MESSAGES = 1000
+_MEMORY_NANOS = 20_000_000_000
 
 
 @dataclass(frozen=True)
@@ -87,23 +91,23 @@ class CheckReport:
         return "\n".join(lines)
 
 
-def check_log(paths: Sequence[Path], topics: Mapping[str, str], picture: Path | None) -> CheckReport:
+def check_log(paths: Sequence[Path], config: IngestConfig, picture: Path | None) -> CheckReport:
     """Look a log over.
 
     Args:
         paths: files of one recording, in order.
-        topics: topic by role, where the guess is wrong.
+        config: as ingest would have it.
         picture: where to write the first keyframe (PNG); None for no picture.
     """
     seen = peek(LogReader(paths))
-    roles = choose_roles(seen, topics)
+    roles = choose_roles(seen, config.topics)
     reader = LogReader(paths)
-    survey = _Survey(reader, roles)
+    survey = _Survey(reader, roles, config)
     survey.read()
     findings = [*_role_findings(seen, roles), *survey.findings(), *_loss_findings(reader)]
     drawn = None
     if picture is not None and not any(finding.level == "error" for finding in findings):
-        more, drawn = _draw_first(paths, roles, topics, picture)
+        more, drawn = _draw_first(paths, roles, seen, config, picture)
         findings += more
     return CheckReport(
         log=paths[0].stem,
@@ -121,10 +125,10 @@ class _Survey:
 
     reader: LogReader
     roles: Roles
+    config: IngestConfig
     tallies: dict[Channel, TopicTally] = field(default_factory=dict)
     clock: StampClock = field(default_factory=StampClock)
     tree: FrameTree = field(default_factory=FrameTree)
-    pairs: PairBuffer = field(default_factory=lambda: PairBuffer(round(IngestConfig().pair_tolerance_s * 1e9)))
     paired: int = 0
     accel: list[float] = field(default_factory=list)
     gyro: list[float] = field(default_factory=list)
@@ -138,6 +142,9 @@ class _Survey:
     def duration_s(self) -> float:
         """Log time from first to last message."""
         return 0.0 if self.earliest is None else (self.latest - self.earliest) / 1e9
+
+    def __post_init__(self) -> None:
+        self.pairs = PairBuffer(round(self.config.pair_tolerance_s * 1e9))
 
     def read(self) -> None:
         """Read every message once."""
@@ -158,17 +165,23 @@ class _Survey:
     def _decode(self, raw: RawMessage, decode: Callable[[bytes], Message], role: str, tally: TopicTally) -> None:
         try:
             message = decode(raw.data)
+            if isinstance(message, Odometry | Pose):
+                matrix_from_pose(message.position, message.orientation)
         except SemslamError as error:
             tally.skip(error.message)
             return
         if isinstance(message, Transforms):
             static = "static" in raw.channel.topic
             for t in message.transforms:
-                self.tree.add(t.parent, t.child, t.stamp_nanos, t.translation, t.orientation, static)
+                stamp = self.clock.stamp(raw.channel.topic, t.stamp_nanos, raw.log_time)
+                self.tree.add(t.parent, t.child, stamp, t.translation, t.orientation, static)
+                if tally.messages % _TIDY_MESSAGES == 0:
+                    self.tree.forget_before(stamp - _MEMORY_NANOS)
             return
         stamp = self.clock.stamp(raw.channel.topic, message.stamp_nanos, raw.log_time)
         if isinstance(message, Image | CompressedImage):
-            self.offsets.append(raw.log_time - stamp)
+            if len(self.offsets) < _SAMPLES:
+                self.offsets.append(raw.log_time - stamp)
             self.paired += sum(
                 1 for _ in self.pairs.push(role, Stamped(stamp, raw.log_time, replace(message, data=b"")))
             )
@@ -176,7 +189,7 @@ class _Survey:
                 self.image_sizes[role] = (message.width, message.height)
         elif isinstance(message, CameraInfo):
             self.infos[role] = message
-        elif isinstance(message, Imu) and len(self.accel) < _IMU_SAMPLES:
+        elif isinstance(message, Imu) and len(self.accel) < _SAMPLES:
             self.accel.append(float(np.linalg.norm(message.accel)))
             self.gyro.append(float(np.linalg.norm(message.gyro)))
 
@@ -193,11 +206,12 @@ class _Survey:
         colour = self.roles.topics.get("colour")
         if colour is None or "depth" not in self.roles.topics:
             return
+        tolerance = f"{self.config.pair_tolerance_s * 1e3:g} ms"
         total = self.tallies.get(colour.channel, TopicTally()).messages
         share = self.paired / total if total else 0.0
         level = "ok" if share > 0.9 else ("warning" if self.paired else "error")
         hint = "" if share > 0.9 else "allow more time between them with `--set ingest.pair_tolerance_s=0.1`"
-        yield Finding(level, f"{self.paired:,} of {total:,} colour images have a depth image within 30 ms", hint)
+        yield Finding(level, f"{self.paired:,} of {total:,} colour images have a depth image within {tolerance}", hint)
 
     def _clocks(self) -> Iterator[Finding]:
         for channel in self.tallies:
@@ -345,10 +359,11 @@ def _finding_line(finding: Finding) -> str:
 
 
 def _draw_first(
-    paths: Sequence[Path], roles: Roles, topics: Mapping[str, str], picture: Path
+    paths: Sequence[Path], roles: Roles, seen: Sequence[TopicSeen], config: IngestConfig, picture: Path
 ) -> tuple[list[Finding], Path | None]:
     """Write the first keyframe as a picture, and say how it was levelled and whether its depth is plausible."""
-    walk = KeyframeWalk(LogReader(paths), roles, IngestConfig(topics=dict(topics), period_s=3600.0), {})
+    once = replace(config, keyframes="time", period_s=3600.0)
+    walk = KeyframeWalk(LogReader(paths), roles, once, {}, static_transforms(seen))
     keyframe = next(walk.keyframes(), None)
     if keyframe is None:
         warnings = "; ".join(walk.warnings[:3]) or "no pair could be decoded"

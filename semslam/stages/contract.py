@@ -32,6 +32,7 @@ class Stage:
         unit: what its progress counts.
         from_log: whether it reads the log files themselves (their digests are then part of the cache key).
         optional: tables among `writes` that may be absent, such as truth.
+        libraries: distributions whose code shapes the stage's bytes; their versions are part of the cache key.
         variants: name of the config field that lists the stage's variants; each is a task with its own cache entry,
             run with `config.for_variant(name)`. Later stages run once for each variant. Empty: no variants.
     """
@@ -46,6 +47,7 @@ class Stage:
     from_log: bool = False
     optional: tuple[Table, ...] = ()
     variants: str = ""
+    libraries: tuple[str, ...] = ()
 
     def load(self) -> Callable[[StageContext], None]:
         """Import the stage's code and return its entry function."""
@@ -136,7 +138,7 @@ class StageContext(Protocol):
 
     @property
     def threads(self) -> int:
-        """Threads a library may use in this process."""
+        """Threads a library may use in this process: one, since sums come out otherwise with more."""
 
     def read(self, table: Table) -> TableSource:
         """A table that the stage declared in `reads`."""

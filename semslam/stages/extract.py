@@ -20,7 +20,7 @@ from semslam.errors import SemslamError
 from semslam.geometry import rle
 from semslam.geometry.grid import to_sparse
 from semslam.geometry.projection import extent, observe, points_in_robot
-from semslam.labels import FIRST_OBJECT, class_list
+from semslam.labels import FIRST_OBJECT, RESERVED, UNOBSERVED, class_list
 from semslam.models.detectors import Detector
 from semslam.models.segmenters import Segmenter, open_segmenter
 from semslam.stages.contract import ShardWriter, StageContext, row_shards
@@ -50,12 +50,22 @@ def run(ctx: StageContext) -> None:
             shard.note("provider", detector.provider)
             detections = shard.table(DETECTIONS, {"classes": classes.all})
             observations = shard.table(OBSERVATIONS, meta)
+            failures: list[SemslamError] = []
             for done, frame in enumerate(_frames(frames.batches(None, start, stop, 4), config), start + 1):
-                seen = look(frame, detector, segmenter, classes, config)
+                try:
+                    seen = look(frame, detector, segmenter, classes, config)
+                except SemslamError as error:
+                    failures.append(error)
+                    shard.warn(f"keyframe {frame.row['frame']} left out: {error.message}")
+                    seen = blind(frame, config)
                 detections.append(_columns(DETECTIONS, seen.detections))
                 observations.append(_columns(OBSERVATIONS, [seen.observation]))
                 _count(shard, seen)
                 ctx.progress(done, frames.rows)
+            if failures:
+                shard.count("frames_failed", len(failures))
+                if len(failures) == stop - start:
+                    raise failures[0]  # not a bad frame, but a model that does not fit
 
 
 @dataclass(frozen=True)
@@ -78,9 +88,20 @@ class ObjectClasses:
             for name in getattr(config, key):
                 if name not in names and not (key == "exclude" and name == "person"):
                     raise _unknown_class(key, name, names)
+        for old, new in config.remap.items():
+            if new in RESERVED or not new.strip() or not new.isprintable():
+                raise SemslamError(
+                    f"`extract.remap` gives class `{old}` the name {new!r}, which no object class may have",
+                    hint=f"choose another name; {', '.join(RESERVED)} are reserved",
+                )
         kept = [i for i, n in enumerate(names) if (not config.select or n in config.select) and n not in config.exclude]
         renamed = {i: config.remap.get(names[i], names[i]) for i in kept}
         objects = tuple(dict.fromkeys(renamed.values()))
+        if (FIRST_OBJECT + len(objects)) * config.side**2 >= 2**32:
+            raise SemslamError(
+                f"{len(objects)} classes on {config.side} x {config.side} cells are more than a table can number",
+                hint="choose classes with `extract.select`, or lower `extract.side`",
+            )
         ids = {name: FIRST_OBJECT + index for index, name in enumerate(objects)}
         return ObjectClasses(class_list(objects), {i: ids[name] for i, name in renamed.items()})
 
@@ -176,6 +197,19 @@ def look(frame: Frame, detector: Detector, segmenter: Segmenter, classes: Object
         "objects": sum(row["depth_pixels"] > 0 for row in rows),
     }
     return Seen(rows, observation, found.dropped)
+
+
+def blind(frame: Frame, config: ExtractConfig) -> Seen:
+    """What a keyframe tells that could not be looked at: nothing, everywhere."""
+    cells = np.arange(config.side**2, dtype=np.uint32) + UNOBSERVED * config.side**2
+    observation = {
+        "frame": frame.row["frame"],
+        "stamp_nanos": frame.row["stamp_nanos"],
+        "cells": cells,
+        "weights": np.ones(cells.size, np.float32),
+        "objects": 0,
+    }
+    return Seen([], observation, 0)
 
 
 def _detection_row(

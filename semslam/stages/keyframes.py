@@ -7,7 +7,7 @@ speaks about its moment has been read: the IMU window around it, odometry and tr
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from semslam.errors import SemslamError
 from semslam.geometry.camera import Camera
 from semslam.geometry.frame_tree import FrameTree
-from semslam.geometry.frames import SE2, Matrix, matrix_from_pose, planar, wrap_angle
+from semslam.geometry.frames import SE2, Matrix, invert, matrix_from_pose, planar, wrap_angle
 from semslam.geometry.levelling import FloorTracker, GravityFilter, floor_height, roll_pitch
 from semslam.geometry.motion import ImuIntegrator, PoseTrack
 from semslam.geometry.registration import register_depth
@@ -26,10 +26,20 @@ from semslam.geometry.rig import ASSUMED_HEIGHT_M, MAX_GAP_NANOS, Attitude, Rig,
 from semslam.logs.clock import StampClock
 from semslam.logs.decode import decoder_for, kind_of
 from semslam.logs.images import decode_colour, decode_depth
-from semslam.logs.messages import CameraInfo, CompressedImage, Image, Imu, Message, Odometry, Pose, Transforms
+from semslam.logs.messages import (
+    CameraInfo,
+    CompressedImage,
+    Image,
+    Imu,
+    Message,
+    Odometry,
+    Pose,
+    Transform,
+    Transforms,
+)
 from semslam.logs.pairing import PairBuffer, Stamped
 from semslam.logs.reader import Channel, LogReader, RawMessage
-from semslam.logs.roles import Roles, frame_of
+from semslam.logs.roles import Roles, TopicSeen, frame_of
 from semslam.stages.settings import IngestConfig
 from semslam.tables.pictures import encode_colour, encode_depth
 
@@ -41,6 +51,14 @@ _MEMORY_NANOS = 20_000_000_000
 """Tracks and transforms older than this are forgotten."""
 _PATIENCE_NANOS = 3_000_000_000
 """A keyframe waits no longer for data about its moment, in log time."""
+_TIDY_MESSAGES = 1000
+"""So many messages from one forgetting to the next."""
+_CONTINUOUS = "odom"
+"""Frame in which the robot's pose never jumps, by convention (ROS REP 105)."""
+_ACCEL_SAMPLES = 500
+_GRAVITY_IN_G = (0.8, 1.2)
+_PLAUSIBLE_DEPTH_M = (0.1, 30.0)
+"""Medians of depth images beyond these are a wrong unit, or no room for a robot."""
 _MAX_WARNINGS = 100
 _LAST_NANOS = 2**63 - 2**50
 """Latest time taken for one; arithmetic on stamps stays within int64."""
@@ -57,8 +75,15 @@ class Keyframe:
     truth: Row | None
     floor_m: float | None
     """Floor found in this frame, metres relative to the camera; None without one."""
-    decoded: bool
-    """False if an earlier run had already published it: `frame` then has no images."""
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """Where odometry and tf had the robot at a stamp, kept so that a step may be longer than the memory of tracks."""
+
+    stamp_nanos: int
+    odometry: Matrix | None
+    tf: Matrix | None
 
 
 @dataclass(frozen=True)
@@ -81,11 +106,18 @@ class KeyframeWalk:
         reader: the log.
         roles: which topic is what; colour, depth and colour_info must be there.
         config: of the ingest stage.
-        known: floor heights by stamp of keyframes that an earlier run published; they are not decoded again.
+        known: floor heights by stamp of keyframes that an earlier run published; they are not decoded again, and their
+            rows have no images.
+        statics: static transforms found ahead, since a recorder may log them late.
     """
 
     def __init__(
-        self, reader: LogReader, roles: Roles, config: IngestConfig, known: Mapping[int, float | None]
+        self,
+        reader: LogReader,
+        roles: Roles,
+        config: IngestConfig,
+        known: Mapping[int, float | None],
+        statics: Iterable[Transforms] = (),
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.warnings: list[str] = []
@@ -95,9 +127,11 @@ class KeyframeWalk:
         self._role_of = {seen.channel: role for role, seen in roles.topics.items()}
         self._decoders: dict[Channel, Callable[[bytes], Message] | None] = {}
         self._infos = {role: seen.first for role, seen in roles.topics.items() if role.endswith("_info")}
-        self._tree = FrameTree()
+        self.tree = FrameTree()
+        for transforms in statics:
+            self._add_transforms(transforms.transforms, 0, static=True)
         self._tracks = {"odometry": PoseTrack(), "truth": PoseTrack()}
-        self._child = {"odometry": "", "truth": ""}
+        self._child = {"odometry": "", "truth": config.truth_frame.lstrip("/")}
         self._gravity = GravityFilter()
         self._imu = ImuIntegrator()
         self._floor = FloorTracker()
@@ -105,10 +139,13 @@ class KeyframeWalk:
         self._candidates: deque[tuple[Stamped, Stamped]] = deque()
         self._waiting: deque[_Picture | Stamped] = deque()
         self._rig: Rig | None = None
-        self._last_chosen: int | None = None
-        self._previous: int | None = None
+        self._chosen: _Moment | None = None
+        self._previous: _Moment | None = None
         self._frames = 0
         self._now = 0
+        self._newest: dict[str, int] = {}
+        self._taken = 0
+        self._accel: list[float] = []
 
     # ---- the walk -------------------------------------------------------------------------------------------------
 
@@ -123,6 +160,9 @@ class KeyframeWalk:
         yield from self._ready(ended=True)
 
     def _take(self, raw: RawMessage) -> None:
+        self._taken += 1
+        if self._taken % _TIDY_MESSAGES == 0:
+            self._forget()
         tally = self.topics.setdefault(raw.channel, TopicTally())
         if raw.log_time > _LAST_NANOS:
             tally.skip(f"log time {raw.log_time} ns lies beyond the year 2262")
@@ -154,15 +194,18 @@ class KeyframeWalk:
             return
         role = self._role_of[channel]
         stamp = self._stamp(channel, message.stamp_nanos, log_time)
+        self._newest[role] = max(stamp, self._newest.get(role, stamp))
         if isinstance(message, Image | CompressedImage):
             self._candidates.extend(self._pairs.push(role, Stamped(stamp, log_time, message)))
             self._count_unpaired()
             self._choose(ended=False)
         elif isinstance(message, Imu):
+            if len(self._accel) < _ACCEL_SAMPLES:
+                self._accel.append(float(np.linalg.norm(message.accel)))
             self._gravity.add(stamp, message.gyro, message.accel)
             self._imu.add(stamp, message.gyro, message.accel)
         elif isinstance(message, Odometry | Pose):
-            self._child[role] = getattr(message, "child_frame_id", "").lstrip("/")
+            self._child[role] = getattr(message, "child_frame_id", "").lstrip("/") or self._child[role]
             self._tracks[role].add(stamp, matrix_from_pose(message.position, message.orientation))
         elif isinstance(message, CameraInfo):
             self._infos[role] = message
@@ -173,10 +216,14 @@ class KeyframeWalk:
         return self.clock.stamp(channel.topic, stamp_nanos, log_time)
 
     def _use_transforms(self, channel: Channel, message: Transforms, log_time: int) -> None:
-        static = "static" in channel.topic
         for t in message.transforms:
             stamp = self._stamp(channel, t.stamp_nanos, log_time)
-            self._tree.add(t.parent, t.child, stamp, t.translation, t.orientation, static)
+            self._newest["tf"] = max(stamp, self._newest.get("tf", stamp))
+            self._add_transforms((t,), stamp, static="static" in channel.topic)
+
+    def _add_transforms(self, transforms: Iterable[Transform], stamp: int, *, static: bool) -> None:
+        for t in transforms:
+            self.tree.add(t.parent, t.child, stamp, t.translation, t.orientation, static)
 
     def _count_unpaired(self) -> None:
         self.counts["colour_unpaired"] += self._pairs.unpaired
@@ -192,6 +239,7 @@ class KeyframeWalk:
             if not (ended or self._config.keyframes == "time" or self._can_speak(colour)):
                 return
             self._candidates.popleft()
+            self.counts["pairs"] += 1
             if self._is_due(colour.stamp_nanos):
                 self._develop(colour, depth)
 
@@ -204,16 +252,15 @@ class KeyframeWalk:
         return self._now - colour.log_time_nanos > _PATIENCE_NANOS
 
     def _is_due(self, stamp: int) -> bool:
-        if self._last_chosen is None:
+        if self._chosen is None:
             return True
-        elapsed = stamp - self._last_chosen
+        elapsed = stamp - self._chosen.stamp_nanos
         period = round(self._config.period_s * 1e9)
         late = elapsed >= period - min(_SLACK_NANOS, period // 10)
         if self._config.keyframes == "time":
             return late
-        moved = self._motion_from("odometry", self._last_chosen, stamp) or self._motion_from(
-            "tf", self._last_chosen, stamp
-        )
+        here = self._rough_moment(stamp)
+        moved = _between(self._chosen.odometry, here.odometry) or _between(self._chosen.tf, here.tf)
         if moved is None:
             return late  # nobody can say whether the robot moved: go by time
         far = float(np.hypot(moved.x_m, moved.y_m)) >= self._config.min_distance_m
@@ -223,7 +270,7 @@ class KeyframeWalk:
         """Decode and register a chosen pair; a damaged one is counted and its successor chosen instead."""
         if colour.stamp_nanos in self._known:
             self._waiting.append(colour)
-            self._last_chosen = colour.stamp_nanos
+            self._chosen = self._rough_moment(colour.stamp_nanos)
             return
         try:
             picture = self._picture(colour, depth)
@@ -232,7 +279,7 @@ class KeyframeWalk:
             self._warn(f"frame at {colour.stamp_nanos} ns skipped: {error.message}")
             return
         self._waiting.append(picture)
-        self._last_chosen = colour.stamp_nanos
+        self._chosen = self._rough_moment(colour.stamp_nanos)
 
     def _picture(self, colour: Stamped, depth: Stamped) -> _Picture:
         rgb = decode_colour(colour.message)
@@ -240,9 +287,6 @@ class KeyframeWalk:
         colour_camera = self._camera("colour_info", rgb.shape[:2])
         depth_camera = self._camera("depth_info", depth_m.shape[:2])
         pinhole = colour_camera.rectified()
-        if not depth_camera.is_pinhole:
-            flat = depth_camera.rectified()
-            depth_m, depth_camera = depth_camera.rectify(depth_m, cv2.INTER_NEAREST), flat
         colour_from_depth = self._colour_from_depth(colour, depth)
         registered = register_depth(depth_m, depth_camera, pinhole, colour_from_depth)
         return _Picture(
@@ -272,7 +316,7 @@ class KeyframeWalk:
         to, source = frame_of(colour.message).lstrip("/"), frame_of(depth.message).lstrip("/")
         if to == source:
             return np.eye(4)
-        found = self._tree.lookup(to, source, colour.stamp_nanos, MAX_GAP_NANOS) if to and source else None
+        found = self.tree.lookup(to, source, colour.stamp_nanos, MAX_GAP_NANOS) if to and source else None
         if found is None:
             self._warn(f"tf does not connect depth frame `{source}` to colour frame `{to}`: taken to be in one place")
             return np.eye(4)
@@ -300,23 +344,24 @@ class KeyframeWalk:
         attitude = self._attitude(rig, stamp)
         floor = self._known[stamp] if isinstance(waiting, Stamped) else _floor(waiting, attitude)
         height, height_source = self._height(rig, attitude, stamp, floor)
-        motion, source = self._motion(self._previous, stamp) if self._previous is not None else (None, "start")
+        here = self._moment(stamp)
+        motion, source = self._motion(self._previous, here) if self._previous is not None else (None, "start")
         keyframe = Keyframe(
             frame=self._frame_row(waiting, attitude, height, height_source),
             motion=self._motion_row(stamp, motion, source),
             truth=self._truth_row(stamp),
             floor_m=floor,
-            decoded=isinstance(waiting, _Picture),
         )
         self._count(attitude, height_source, source)
-        self._previous, self._frames = stamp, self._frames + 1
-        self._forget(stamp)
+        if isinstance(waiting, _Picture):
+            self._judge_depth(waiting.points[:, 2])
+        self._previous, self._frames = here, self._frames + 1
         return keyframe
 
     def _settle_rig(self, colour: Stamped) -> Rig:
         imu = self._roles.topics.get("imu")
         self._rig = decide_rig(
-            self._tree,
+            self.tree,
             camera=frame_of(colour.message),
             imu=frame_of(imu.first) if imu else "",
             odometry_child=self._child["odometry"],
@@ -329,13 +374,14 @@ class KeyframeWalk:
 
     def _attitude(self, rig: Rig, stamp: int) -> Attitude:
         up = self._gravity.up_at(stamp)
-        attitude = rig.attitude(self._tree, stamp, up)
+        attitude = rig.attitude(self.tree, stamp, up)
         if attitude is None:
-            newest = self._tree.known_until(rig.body, rig.camera)
             self._warn(f"tf has gaps between `{rig.body}` and `{rig.camera}`: the nearest transform is used")
-            attitude = rig.attitude(self._tree, min(stamp, newest or stamp), up)
+            known = self.tree.known_between(rig.body, rig.camera)
+            near = stamp if known is None else min(max(stamp, known[0]), known[1])
+            attitude = rig.attitude(self.tree, near, up)
         if attitude is None:
-            attitude = Rig("", rig.camera, rig.imu, rig.levelling, ()).attitude(self._tree, stamp, up)
+            attitude = Rig("", rig.camera, rig.imu, rig.levelling, ()).attitude(self.tree, stamp, up)
             self.counts["frames_without_camera_pose"] += 1
         assert attitude is not None  # a rig without a body needs no tf
         return attitude
@@ -357,33 +403,33 @@ class KeyframeWalk:
         )
         return ASSUMED_HEIGHT_M, "none"
 
-    def _motion(self, start: int, stop: int) -> tuple[SE2 | None, str]:
-        """Motion of the robot between two stamps, in its frame at the first, from the best source that knows it."""
-        for source in ("odometry", "tf", "imu") if self._config.motion == "auto" else (self._config.motion,):
-            motion = self._motion_from(source, start, stop)
+    def _moment(self, stamp: int) -> _Moment:
+        return _Moment(stamp, self._pose("odometry", stamp), self._pose_from_tf(stamp))
+
+    def _rough_moment(self, stamp: int) -> _Moment:
+        """The same for choosing keyframes, which begins before it is settled which frame is the robot's."""
+        return _Moment(stamp, self._pose_of_child("odometry", stamp), self._pose_from_tf(stamp))
+
+    def _motion(self, start: _Moment, stop: _Moment) -> tuple[SE2 | None, str]:
+        """Motion of the robot between two moments, in its frame at the first, from the best source that knows it."""
+        sources: dict[str, Callable[[], SE2 | None]] = {
+            "odometry": lambda: _between(start.odometry, stop.odometry),
+            "tf": lambda: _between(start.tf, stop.tf),
+            "imu": lambda: self._motion_from_imu(start.stamp_nanos, stop.stamp_nanos),
+        }
+        for source in sources if self._config.motion == "auto" else [self._config.motion]:
+            motion = sources[source]() if source in sources else None
             if motion is not None:
                 return motion, source
         return None, "none"
 
-    def _motion_from(self, source: str, start: int, stop: int) -> SE2 | None:
-        if source == "odometry":
-            poses = [self._pose("odometry", stamp) for stamp in (start, stop)]
-        elif source == "tf":
-            poses = [self._pose_from_tf(stamp) for stamp in (start, stop)]
-        elif source == "imu" and "imu" in self._roles.topics:
-            return self._motion_from_imu(start, stop)
-        else:
-            return None
-        before, after = poses
-        if before is None or after is None:
-            return None
-        return planar(before).between(planar(after))
-
     def _motion_from_imu(self, start: int, stop: int) -> SE2 | None:
+        if "imu" not in self._roles.topics:
+            return None
         motion = self._imu.motion(start, stop, self._gravity.up_at(start))
         if motion is None or self._rig is None:
             return motion
-        body_from_imu = self._rig.body_from(self._tree, self._rig.imu, start)
+        body_from_imu = self._rig.body_from(self.tree, self._rig.imu, start)
         if body_from_imu is None:
             return motion
         robot_from_imu = planar(body_from_imu)
@@ -391,22 +437,27 @@ class KeyframeWalk:
 
     def _pose(self, role: str, stamp: int) -> Matrix | None:
         """world_from_body from a track of poses, in that track's own world."""
-        track = self._tracks[role]
-        near = _into(stamp, track.first, track.last)
-        world_from_child = track.at(near, round(self._config.motion_gap_s * 1e9))
+        world_from_child = self._pose_of_child(role, stamp)
         if world_from_child is None or self._rig is None or not self._child[role]:
             return world_from_child
-        body_from_child = self._rig.body_from(self._tree, self._child[role], stamp)
+        body_from_child = self._rig.body_from(self.tree, self._child[role], stamp)
         if body_from_child is None:
             return world_from_child
-        return np.asarray(world_from_child @ np.linalg.inv(body_from_child))
+        return np.asarray(world_from_child @ invert(body_from_child))
+
+    def _pose_of_child(self, role: str, stamp: int) -> Matrix | None:
+        """world_from_child as the messages of a role tell it, interpolated."""
+        track = self._tracks[role]
+        return track.at(_into(stamp, track.first, track.last), round(self._config.motion_gap_s * 1e9))
 
     def _pose_from_tf(self, stamp: int) -> Matrix | None:
         body = self._rig.body if self._rig else ""
-        root = self._tree.root_of(body) if body else None
-        if root is None or root == body or self._tree.is_static_path(root, body):
+        root = self.tree.root_of(body) if body else None
+        if self.tree.known_between(_CONTINUOUS, body) is not None:
+            root = _CONTINUOUS  # above it, localisation may jump, and a jump is no motion
+        if root is None or root == body or self.tree.is_static_path(root, body):
             return None
-        return self._tree.lookup(root, body, stamp, round(self._config.motion_gap_s * 1e9))
+        return self.tree.lookup(root, body, stamp, round(self._config.motion_gap_s * 1e9))
 
     # ---- rows -----------------------------------------------------------------------------------------------------
 
@@ -477,13 +528,35 @@ class KeyframeWalk:
         self.counts[f"height_{height_source}"] += 1
         self.counts[f"motion_{motion_source}"] += 1
 
-    def _forget(self, stamp: int) -> None:
-        before = stamp - _MEMORY_NANOS
-        self._tree.forget_before(before)
-        self._gravity.forget_before(before)
-        for track in self._tracks.values():
-            track.forget_before(before)
-        self._imu.forget_before(stamp)
+    def _judge_depth(self, depth_m: NDArray[np.float64]) -> None:
+        if depth_m.size == 0:
+            self.counts["frames_without_depth"] += 1
+        elif not _PLAUSIBLE_DEPTH_M[0] <= float(np.median(depth_m)) <= _PLAUSIBLE_DEPTH_M[1]:
+            self.counts["frames_of_implausible_depth"] += 1
+
+    def _forget(self) -> None:
+        """Keep some seconds of everything: a robot may be recorded for hours without a picture."""
+        before = {role: newest - _MEMORY_NANOS for role, newest in self._newest.items()}
+        if "tf" in before:
+            self.tree.forget_before(before["tf"])
+        if "imu" in before:
+            self._gravity.forget_before(before["imu"])
+            self._imu.forget_before(before["imu"])
+        for role in before.keys() & self._tracks.keys():
+            self._tracks[role].forget_before(before[role])
+
+    def log_warnings(self) -> Iterator[str]:
+        """What is known of the whole log at its end, for the user."""
+        for channel, tally in sorted(self.topics.items(), key=lambda item: item[0].topic):
+            if tally.skipped:
+                of = f"{tally.skipped:,} of {tally.messages:,} messages of `{channel.topic}`"
+                yield f"{of} cannot be used: {tally.reason}"
+            if jumps := self.clock.jumps(channel.topic):
+                yield f"the clock of `{channel.topic}` was set {jumps} times meanwhile; stamps are corrected"
+        for problem in self.tree.problems():
+            yield f"frames: {problem}"
+        if self._accel and _GRAVITY_IN_G[0] <= float(np.median(self._accel)) <= _GRAVITY_IN_G[1]:
+            yield "the accelerometer seems to measure in g, not in m/s^2: it cannot level the camera"
 
     def start_notes(self) -> None:
         """Begin counts and warnings anew: each shard tells its own, so that a resumed run tells the same."""
@@ -522,8 +595,18 @@ class TopicTally:
         self.reason = self.reason or reason
 
 
+def static_transforms(seen: Iterable[TopicSeen]) -> list[Transforms]:
+    """Static transforms among the first messages of a log, for a recorder that writes them late."""
+    return [t.first for t in seen if isinstance(t.first, Transforms) and "static" in t.channel.topic]
+
+
 def _colour_of(waiting: _Picture | Stamped) -> Stamped:
     return waiting if isinstance(waiting, Stamped) else waiting.colour
+
+
+def _between(before: Matrix | None, after: Matrix | None) -> SE2 | None:
+    """Planar motion from one pose to another, in the frame of the first."""
+    return None if before is None or after is None else planar(before).between(planar(after))
 
 
 def _into(stamp: int, first: int | None, last: int | None) -> int:

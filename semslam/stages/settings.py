@@ -35,8 +35,10 @@ class IngestConfig:
 
     topics: Mapping[str, str] = setting({})
     """Topics by role, for what the guess gets wrong: colour, depth, colour_info, depth_info, imu, odometry, truth."""
+    truth_frame: str = setting("")
+    """Frame whose pose the truth topic tells, where its messages do not say; empty takes the robot's."""
     keyframes: str = setting("time", choices=("time", "motion"))
-    """Take a keyframe every `period_s`, or when the robot has moved (`min_distance_m`, `min_turn_rad`)."""
+    """Take a keyframe every `period_s`, or when odometry or tf has moved by `min_distance_m` or `min_turn_rad`."""
     period_s: float = setting(1.0, low=0.0, high=3600.0)
     """Least time between keyframes, seconds. 0 keeps every pair."""
     min_distance_m: float = setting(0.3, low=0.0, high=100.0)
@@ -111,7 +113,7 @@ class PaperConfig:
 
     cell_m: float = setting(0.3, low=0.01, high=10.0)
     """Cell of the map, metres; an odd multiple of extract.cell_m."""
-    map_side: int = setting(33, low=3, high=2001)
+    map_side: int = setting(33, low=3, high=501)
     """Cells along a side of the map. H = W."""
     side: int = setting(11, low=3, high=2001)
     """Cells along a side of the observation. h."""

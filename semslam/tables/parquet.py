@@ -122,7 +122,14 @@ class TableFiles:
         self._table = table
         self._paths = tuple(paths)
         self._files = [_open(path, table) for path in self._paths]
-        self._meta = _header(self._files[0], self._paths[0], table)["meta"] if self._files else {}
+        metas = [_header(file, path, table)["meta"] for file, path in zip(self._files, self._paths, strict=True)]
+        self._meta = metas[0] if metas else {}
+        for path, meta in zip(self._paths, metas, strict=True):
+            if meta != self._meta:
+                raise TableError(
+                    f"Table file `{path}` was made with other classes or another grid than `{self._paths[0]}`",
+                    hint="`semslam verify OUT` lists damaged entries",
+                )
 
     @property
     def rows(self) -> int:
@@ -198,7 +205,10 @@ def _open(path: Path, table: Table) -> pq.ParquetFile:
 
 def _header(file: pq.ParquetFile, path: Path, table: Table) -> dict[str, Any]:
     raw = (file.schema_arrow.metadata or {}).get(_KEY)
-    header: dict[str, Any] = json.loads(raw) if raw else {}
+    try:
+        header: dict[str, Any] = json.loads(raw) if raw else {}
+    except ValueError as error:
+        raise _damaged(path, error) from error
     if header.get("table") != table.name or header.get("spec") != SPEC_VERSION:
         found = f"table `{header.get('table')}` of specification {header.get('spec')}" if header else "no semslam table"
         raise TableError(

@@ -93,7 +93,7 @@ FRAMES = Table(
         _FRAME,
         _STAMP,
         _c("log_time_nanos", "int64", "ns", "log time of the colour message"),
-        _c("colour", "binary", "", "JPEG or PNG file, 3 channels, rectified (pinhole)"),
+        _c("colour", "binary", "", "JPEG or PNG file, colour or grey, rectified (pinhole)"),
         _c(
             "depth",
             "binary",
