@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semslam.geometry.frames import SE2, Matrix, matrix_from_pose, rotation_from_vector, wrap_angle
-from semslam.geometry.motion import ImuIntegrator, PoseTrack, relative
+from semslam.geometry.motion import ImuIntegrator, PoseTrack, motion_between
 
 Vector = NDArray[np.float64]
 SECOND = 1_000_000_000
@@ -51,11 +51,11 @@ def test_relative_motion_is_seen_from_the_start(
     track = PoseTrack()
     track.add(0, standing(start.x_m, start.y_m, start.heading_rad))
     track.add(SECOND, standing(stop.x_m, stop.y_m, stop.heading_rad))
-    found = relative(track, 0, SECOND, SECOND)
+    found = motion_between(track.at(0, SECOND), track.at(SECOND, SECOND))
     assert found is not None
     assert (found.x_m, found.y_m) == pytest.approx((dx, dy), abs=1e-9)
     assert wrap_angle(found.heading_rad - turn) == pytest.approx(0.0, abs=1e-9)
-    assert relative(track, 0, 2 * SECOND, SECOND) is None
+    assert motion_between(track.at(0, SECOND), track.at(2 * SECOND, SECOND)) is None
 
 
 TILT = rotation_from_vector((0.0, 0.35, 0.0)) @ rotation_from_vector((-0.1, 0.0, 0.0))

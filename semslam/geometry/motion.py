@@ -68,15 +68,12 @@ class PoseTrack:
         self._poses.forget_before(stamp_nanos)
 
 
-def relative(track: PoseTrack, start_nanos: int, stop_nanos: int, max_gap_nanos: int) -> SE2 | None:
-    """Planar motion of the body between two stamps, in its frame at the first; None if the track misses one of them.
+def motion_between(before: Matrix | None, after: Matrix | None) -> SE2 | None:
+    """Planar motion from one pose world_from_body to another, in the body's frame at the first; None if one is missing.
 
-    The track's world must be z-up.
+    The world must be z-up.
     """
-    before, after = track.at(start_nanos, max_gap_nanos), track.at(stop_nanos, max_gap_nanos)
-    if before is None or after is None:
-        return None
-    return planar(before).between(planar(after))
+    return None if before is None or after is None else planar(before).between(planar(after))
 
 
 class ImuIntegrator:

@@ -20,7 +20,7 @@ from semslam.geometry.camera import Camera
 from semslam.geometry.frame_tree import FrameTree
 from semslam.geometry.frames import SE2, Matrix, invert, matrix_from_pose, planar, wrap_angle
 from semslam.geometry.levelling import FloorTracker, GravityFilter, floor_height, roll_pitch
-from semslam.geometry.motion import ImuIntegrator, PoseTrack
+from semslam.geometry.motion import ImuIntegrator, PoseTrack, motion_between
 from semslam.geometry.registration import register_depth
 from semslam.geometry.rig import ASSUMED_HEIGHT_M, MAX_GAP_NANOS, Attitude, Rig, decide_rig
 from semslam.logs.clock import StampClock
@@ -260,7 +260,7 @@ class KeyframeWalk:
         if self._config.keyframes == "time":
             return late
         here = self._rough_moment(stamp)
-        moved = _between(self._chosen.odometry, here.odometry) or _between(self._chosen.tf, here.tf)
+        moved = motion_between(self._chosen.odometry, here.odometry) or motion_between(self._chosen.tf, here.tf)
         if moved is None:
             return late  # nobody can say whether the robot moved: go by time
         far = float(np.hypot(moved.x_m, moved.y_m)) >= self._config.min_distance_m
@@ -413,8 +413,8 @@ class KeyframeWalk:
     def _motion(self, start: _Moment, stop: _Moment) -> tuple[SE2 | None, str]:
         """Motion of the robot between two moments, in its frame at the first, from the best source that knows it."""
         sources: dict[str, Callable[[], SE2 | None]] = {
-            "odometry": lambda: _between(start.odometry, stop.odometry),
-            "tf": lambda: _between(start.tf, stop.tf),
+            "odometry": lambda: motion_between(start.odometry, stop.odometry),
+            "tf": lambda: motion_between(start.tf, stop.tf),
             "imu": lambda: self._motion_from_imu(start.stamp_nanos, stop.stamp_nanos),
         }
         for source in sources if self._config.motion == "auto" else [self._config.motion]:
@@ -602,11 +602,6 @@ def static_transforms(seen: Iterable[TopicSeen]) -> list[Transforms]:
 
 def _colour_of(waiting: _Picture | Stamped) -> Stamped:
     return waiting if isinstance(waiting, Stamped) else waiting.colour
-
-
-def _between(before: Matrix | None, after: Matrix | None) -> SE2 | None:
-    """Planar motion from one pose to another, in the frame of the first."""
-    return None if before is None or after is None else planar(before).between(planar(after))
 
 
 def _into(stamp: int, first: int | None, last: int | None) -> int:

@@ -32,13 +32,6 @@ class Table:
     stage: str
     columns: tuple[Column, ...]
 
-    def column(self, name: str) -> Column:
-        """The column of that name; KeyError if there is none."""
-        for column in self.columns:
-            if column.name == name:
-                return column
-        raise KeyError(name)
-
 
 TYPES = (
     "bool",
