@@ -225,6 +225,17 @@ def test_split_files_are_merged_by_log_time(tmp_path: Path) -> None:
     assert [file.name for file in reader.losses.files] == ["1.mcap", "0.mcap"]
 
 
+def test_an_empty_part_of_a_recording_is_a_loss_like_others(tmp_path: Path) -> None:
+    """A recorder that died as it opened the next file leaves one of 0 bytes: the others are read, the gap is told."""
+    whole = log(chunk(channel(1, "/x"), message(1, 1), message(1, 4), times=(1, 4)))
+    found, reader = read(save(tmp_path, whole, "0.mcap"), save(tmp_path, b"", "1.mcap"))
+    assert times(found) == [1, 4]
+    assert (reader.losses.state, reader.losses.truncated) == ("salvaged", True)
+    assert reader.losses.problems == ["file 2 of 2: is empty (0 bytes)"]
+    assert [(c.topic, count) for c, count in reader.channels()] == [("/x", 2)]
+    assert "empty" in refusal(save(tmp_path, b"", "1.mcap"), save(tmp_path, b"", "2.mcap")).message
+
+
 Messages = list[tuple[int, int, bytes]]
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from semslam.errors import SemslamError, UsageError
 from semslam.logs.channels import Channel
+from semslam.logs.images import _COLOURS
 from semslam.logs.messages import CameraInfo, CompressedImage, Image, Imu, Message, Odometry, Pose
 from semslam.logs.roles import TopicSeen, choose_roles, describe_topics
 
@@ -96,6 +97,34 @@ def test_equal_topics_are_chosen_by_name() -> None:
     """The choice does not depend on the order in which topics stand in the file."""
     one, other = image("/left/rgb/image", "rgb8"), image("/right/rgb/image", "rgb8")
     assert guess(one, other) == guess(other, one)
+    imus = [seen(topic, "imu", Imu(0, "imu", ORIGIN, ORIGIN, None)) for topic in ("/imu/data", "/imu")]
+    assert guess(*imus)["imu"] == "/imu"
+
+
+@pytest.mark.parametrize("encoding", sorted(_COLOURS))
+def test_every_colour_encoding_that_is_decoded_is_found(encoding: str) -> None:
+    """Raw Bayer and YUV cameras too, but the driver's RGB picture of the same camera comes first."""
+    assert guess(image("/cam/image_raw", encoding))["colour"] == "/cam/image_raw"
+    if encoding.startswith(("bayer", "yu", "uy")):
+        both = image("/cam/image_raw", encoding, messages=11), image("/cam/image_rect", "rgb8")
+        assert guess(*both)["colour"] == "/cam/image_rect"
+
+
+@pytest.mark.parametrize("frame", ["front", ""])
+def test_of_two_cameras_the_calibrated_one_is_taken(frame: str) -> None:
+    """Whatever the other is called and however much it sends; its calibration may say so by place or by frame."""
+    webcam = image("/a_webcam/rgb/image", "rgb8", "webcam", messages=999)
+    front = image("/robot/front/image_raw", "rgb8", "front")
+    calibration = info("/front_info" if frame else "/robot/front/camera_info", frame)
+    assert guess(webcam, front, calibration)["colour"] == "/robot/front/image_raw"
+
+
+def test_of_two_cameras_the_one_with_depth_is_taken() -> None:
+    """Depth in its frame, or beside it in the tree of names."""
+    front, rear = image("/robot/front/rgb", "rgb8", "front"), image("/robot/rear/rgb", "rgb8", "rear", messages=999)
+    calibrations = info("/robot/front/info", "front"), info("/robot/rear/info", "rear")
+    for depth in (image("/depths/one", "16UC1", "front"), image("/robot/front/depth", "16UC1", "tof")):
+        assert guess(front, rear, *calibrations, depth)["colour"] == "/robot/front/rgb"
 
 
 def test_override() -> None:
@@ -121,6 +150,9 @@ def test_wrong_overrides_say_what_is_there() -> None:
 
 def test_many_topics_are_told_briefly() -> None:
     """Ten thousand topics do not flood the terminal."""
+    short = describe_topics([image("/a", "rgb8"), compressed("/b", "jpeg"), info("/c", "")])
+    assert "test/image (rgb8)" in short
+    assert "test/compressed_image (jpeg)" in short
     text = describe_topics([image(f"/t{i}", "rgb8") for i in range(10_000)])
     assert "10000 topics" in text
     assert len(text.splitlines()) < 50

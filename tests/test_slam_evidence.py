@@ -146,6 +146,33 @@ def test_a_pose_beyond_all_maps_is_refused() -> None:
     assert len(evidence.cells()["ix"]) == 0
 
 
+@pytest.mark.parametrize("cell_m", [0.1, 0.001])
+def test_the_map_outlives_a_teleport(cell_m: float) -> None:
+    """A robot that odometry throws off any map: what was seen before stays, the snapshot there is empty."""
+    evidence = Evidence(cell_m, SIDE)
+    seen = planes_with(floor=[(0, 0, 1.0)])
+    assert evidence.add(seen, SE2(0.5 * cell_m, 0.5 * cell_m, 0.0), 1)
+    for x_m in (1e6, 9.9e6, 1e9, 1e300, math.inf, math.nan):
+        away = SE2(x_m, -x_m, 0.1)
+        assert evidence.add(seen, away, 2) == (x_m < min(1e7, cell_m * 2**30))
+        assert evidence.snapshot(away).cells.size <= 1
+    cells = evidence.cells()
+    assert (cells["ix"].dtype, cells["ix"].min()) == (np.int32, 0)
+
+
+def test_a_snapshot_of_very_many_classes_stays_within_its_numbers() -> None:
+    """It shows less of the map rather than wrong cells."""
+    evidence, planes = Evidence(CELL_M, 3), np.zeros((3000, 3, 3), np.float32)
+    planes[-1, 1, 1] = 1.0
+    for x_m in (-65.0, -45.0, 0.05, 45.0, 65.0):
+        for y_m in (-65.0, 0.05, 65.0):
+            evidence.add(planes, SE2(x_m, y_m, 0.0), 1)
+    snapshot = evidence.snapshot(SE2(0.0, 0.0, 0.0))
+    assert snapshot.cells.size == 3
+    assert snapshot.cells.max() < 2**32
+    assert 3000 * snapshot.rows * snapshot.columns <= 2**32
+
+
 def test_snapshot_holds_the_same_cells() -> None:
     """As sparse planes over the bounding box; far parts of a torn map stay out of it."""
     evidence = Evidence(CELL_M, SIDE)

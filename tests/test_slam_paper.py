@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+import tracemalloc
 
 import numpy as np
 import onnx
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from semslam.geometry.frames import SE2
 from semslam.labels import FIRST_OBJECT
 from semslam.slam import paper
-from semslam.slam.paper import PoseGrid
+from semslam.slam.paper import PoseGrid, rotate_observation
 
 GRID = PoseGrid(headings=8, side=9, cell_m=0.3)
 ANGLES = st.floats(-math.pi + 1e-6, math.pi)
@@ -106,6 +107,27 @@ def test_correlation_equals_the_sum_over_everything(density: float) -> None:
     rotated = paper.rotate_observation(random_planes((6, 5, 5), 1, density), 8)
     world = random_planes((6, 9, 9), 2, density)
     np.testing.assert_allclose(paper.correlate(rotated, world), slow_scores(rotated, world), atol=2e-5)
+
+
+@pytest.mark.parametrize("patch_bytes", [0, 5_000, 30_000])
+def test_correlation_in_pieces_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch, patch_bytes: int) -> None:
+    """A limit of memory changes no score: single rows and neighbours, a few, or all at once."""
+    rotated = rotate_observation(random_planes((6, 7, 7), 1, 0.4), 12)
+    world = random_planes((6, 19, 23), 2, 0.3)
+    whole = paper.correlate(rotated, world)
+    monkeypatch.setattr(paper, "PATCH_BYTES", patch_bytes)
+    assert np.array_equal(paper.correlate(rotated, world), whole)
+
+
+def test_a_large_map_is_correlated_in_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The neighbourhoods of a map of 301 x 301 cells, 700 MB together, are never gathered at once."""
+    rotated, world = random_planes((2, 4, 31, 31), 1), random_planes((4, 301, 301), 2, 0.1)
+    monkeypatch.setattr(paper, "PATCH_BYTES", 4 << 20)
+    tracemalloc.start()
+    paper.correlate(rotated, world)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 40 << 20
 
 
 def onnx_convolution(image: NDArray[np.float32], kernels: NDArray[np.float32], pad: int) -> NDArray[np.float32]:

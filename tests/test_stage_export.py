@@ -110,19 +110,20 @@ def test_map_server_files(tmp_path: Path) -> None:
     assert image.tolist() == [[205, 205, 205, 0], [205, 205, 205, 205], [205, 205, 205, 205], [254, 0, 205, 205]]
 
 
-@pytest.mark.parametrize(("free", "occupied"), [(0.196, 0.65), (0.25, 0.65), (0.1, 0.15), (0.0, 1.0), (0.5, 0.9)])
+@pytest.mark.parametrize(("free", "occupied"), [(0.196, 0.65), (0.25, 0.65), (0.1, 0.15), (0.004, 0.999), (0.5, 0.9)])
 def test_map_server_reads_the_three_values_as_meant(free: float, occupied: float) -> None:
     """Also under thresholds that would turn the customary 205 into free floor or wall."""
     occupancy = [(255 - grey) / 255 for grey in (0, 254, exchange.unknown_grey(free, occupied))]
-    assert occupancy[0] >= occupied
-    assert occupancy[1] <= max(free, 1 / 255)
+    assert occupancy[0] > occupied
+    assert occupancy[1] < free
     assert free <= occupancy[2] <= occupied
 
 
-def test_thresholds_without_room_between_them_are_refused(tmp_path: Path) -> None:
-    """Both keys are named."""
+@pytest.mark.parametrize(("free", "occupied"), [(0.7, 0.3), (0.0, 0.65), (1 / 255, 0.65), (0.196, 1.0)])
+def test_thresholds_that_lose_one_of_the_three_values_are_refused(tmp_path: Path, free: float, occupied: float) -> None:
+    """No room for unknown cells, or free floor or objects that map_server reads as unknown. Both keys are named."""
     with pytest.raises(SemslamError) as caught:
-        exported(tmp_path, POSE_LIST, CELL_LIST, ExportConfig(free_threshold=0.7, occupied_threshold=0.3))
+        exported(tmp_path, POSE_LIST, CELL_LIST, ExportConfig(free_threshold=free, occupied_threshold=occupied))
     assert "`export.free_threshold`" in caught.value.text()
     assert "`export.occupied_threshold`" in caught.value.text()
 

@@ -122,6 +122,7 @@ class KilledError(Exception):
 def test_a_cut_run_goes_on_with_the_same_bytes(tmp_path: Path, variant: str, cut: int) -> None:
     """Every file of every shard, states included."""
     steps = walk_steps()
+    steps[2] = replace(steps[2], motion=SE2(-50.0, 0.0, 0.0))
     steps[5] = replace(steps[5], motion=None, observation=None)
     straight = make_context(tmp_path / "straight", steps, variant)
     localize.run(straight)
@@ -181,6 +182,55 @@ def test_leaving_the_map_of_the_estimator_is_said(tmp_path: Path) -> None:
     (warning,) = context.shards[0].warnings
     assert warning.startswith("2 keyframes lie outside the map of `paper`, 2.7 m wide")
     assert "`localize.paper.map_side`" in warning
+
+
+def warnings_of(folder: Path, steps: list[Step], variant: str) -> list[str]:
+    context = make_context(folder, steps, variant)
+    localize.run(context)
+    return [warning for shard in context.shards for warning in shard.warnings]
+
+
+def test_a_track_without_trouble_is_not_warned_of(tmp_path: Path) -> None:
+    """Nothing to say about a good log, nor about a single step without motion."""
+    steps = walk_steps(13)
+    steps[6] = replace(steps[6], motion=None)
+    for variant in ("paper", "paper_visual"):
+        assert warnings_of(tmp_path / variant, steps, variant) == []
+
+
+def test_lost_poses_and_missing_motion_are_said_once(tmp_path: Path) -> None:
+    """For the whole log, in its last shard; visual mode does not miss a motion that it never uses."""
+    steps = walk_steps(10)
+    for frame in (2, 3, 7):
+        steps[frame] = replace(steps[frame], motion=None, observation=None)
+    motion, pose = warnings_of(tmp_path / "dead", steps, "dead_reckoning")
+    assert motion.startswith("no motion for 3 of 9 steps")
+    assert pose.startswith("no pose for 3 of 10 keyframes")
+    (pose,) = warnings_of(tmp_path / "visual", steps, "paper_visual")
+    assert pose.startswith("no pose for 3 of 10 keyframes")
+
+
+def test_a_teleport_of_odometry_is_said_by_frame(tmp_path: Path) -> None:
+    """Across shards too; a fast robot between far keyframes is no teleport."""
+    steps = walk_steps(10)
+    steps[4] = replace(steps[4], motion=SE2(100.0, 0.0, 0.0))
+    (jump,) = warnings_of(tmp_path / "one", steps, "dead_reckoning")
+    assert jump.startswith("odometry jumps 100 m between keyframes 3 and 4;")
+    slow = [replace(step, stamp_nanos=step.stamp_nanos * 30) for step in steps]
+    assert warnings_of(tmp_path / "slow", slow, "dead_reckoning") == []
+
+
+def test_odometry_that_leaves_the_planet_costs_no_map(tmp_path: Path) -> None:
+    """What was mapped before stays; what was seen out there is counted, and said."""
+    steps = walk_steps(8)
+    steps[5] = replace(steps[5], motion=SE2(1e9, 0.0, 0.0))
+    context = make_context(tmp_path, steps, "dead_reckoning")
+    localize.run(context)
+    assert len(context.results(CELLS)["cells"].read()["ix"]) > 1000
+    assert sum(shard.counters.get("observations_off_the_map", 0) for shard in context.shards) == 3
+    jump, far = context.shards[-1].warnings
+    assert jump.startswith("odometry jumps 1,000,000,000 m between keyframes 4 and 5;")
+    assert far.startswith("3 observations lie too far")
 
 
 def test_a_log_without_keyframes_gives_empty_tables(tmp_path: Path) -> None:

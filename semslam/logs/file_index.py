@@ -114,9 +114,15 @@ class FileIndex:
 def open_index(path: Path, pool: ChannelPool) -> FileIndex:
     """Find out what lies where. Reads the summary; without a sound one, walks and verifies the whole file.
 
+    A file without a byte, which a recorder that died while opening it leaves behind, is a truncated one.
+
     Raises SemslamError when `path` is not a file that can be read, or nothing in it looks like MCAP.
     """
     source, definitions, losses = open_source(path), Definitions(pool), FileLosses(path.name)
+    if source.size == 0:
+        losses.truncated = True
+        losses.note("is empty (0 bytes)")
+        return FileIndex(source, definitions, None, Layout(), losses)
     finished = has_footer(source)
     start = _start(source, definitions, losses, finished)
     losses.truncated = not finished

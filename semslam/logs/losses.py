@@ -67,8 +67,9 @@ class FileLosses:
         return replace(self, lost_by_topic=dict(self.lost_by_topic), problems=list(self.problems))
 
     def as_json(self) -> dict[str, object]:
-        """Plain values, in a fixed order."""
-        return {"state": self.state} | {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        """Plain values, in a fixed order; no name, so that logs of equal content have equal reports."""
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "name"}
+        return {"state": self.state} | values
 
 
 @dataclass
@@ -130,8 +131,10 @@ class LossReport:
 
     @property
     def problems(self) -> list[str]:
-        """Every kept sentence, led by the file it is about."""
-        return [f"`{file.name}`: {problem}" for file in self.files for problem in file.problems]
+        """Every kept sentence, led by the number of the file it is about where there are several."""
+        count = len(self.files)
+        leads = [f"file {number} of {count}: " if count > 1 else "" for number in range(1, count + 1)]
+        return [f"{lead}{problem}" for lead, file in zip(leads, self.files, strict=True) for problem in file.problems]
 
     def as_json(self) -> dict[str, object]:
         """Plain values for the manifest."""

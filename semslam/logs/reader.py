@@ -25,6 +25,7 @@ from semslam.logs.file_index import open_index
 from semslam.logs.losses import FileLosses, LossReport
 from semslam.logs.merge import FileReading, Merge, RawMessage
 from semslam.logs.records import Attachment, Metadata
+from semslam.logs.source import empty_file
 
 __all__ = ["Attachment", "Channel", "FileLosses", "LogReader", "LossReport", "Metadata", "RawMessage"]
 
@@ -39,8 +40,9 @@ class LogReader:
         paths: the file, or the files a recorder split it into, in recording order.
         memory_bytes: limit for the chunks held at once where their time ranges overlap.
 
-    Raises SemslamError when a file cannot be opened or nothing in it looks like MCAP. Opening reads the summaries; a
-    file without a sound one is read through once, so that its messages can be given in order.
+    Raises SemslamError when a file cannot be opened or nothing in it looks like MCAP; an empty file is a loss as long
+    as another one is not empty. Opening reads the summaries; a file without a sound one is read through once, so that
+    its messages can be given in order.
     """
 
     def __init__(self, paths: Sequence[Path], *, memory_bytes: int = MEMORY_BYTES) -> None:
@@ -49,6 +51,8 @@ class LogReader:
         _refuse_repeats(paths)
         pool = ChannelPool()
         self._files = [open_index(Path(path), pool) for path in paths]
+        if not any(file.source.size for file in self._files):
+            raise empty_file(self._files[0].source)
         self._memory_bytes = memory_bytes
         self.losses = LossReport([file.losses.copy() for file in self._files])
         """What the latest reading lost; complete once `messages()` is exhausted."""

@@ -27,6 +27,10 @@ _KINDS = {
     "truth": ("pose", "odometry"),
 }
 _COLOUR_ENCODINGS = ("rgb8", "bgr8", "rgba8", "bgra8", "8uc3", "8uc4", "mono8", "8uc1")
+_RAW_COLOUR_ENCODINGS = (
+    *("bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"),
+    *("yuv422", "uyvy", "yuv422_yuy2", "yuyv"),
+)
 _DEPTH_ENCODINGS = ("16uc1", "32fc1", "mono16")
 _TRUTH_WORDS = ("ground_truth", "groundtruth", "truth", "mocap", "vicon", "optitrack", "/gt")
 _DEBUG_WORDS = ("debug", "mask", "label", "segment", "overlay", "annotated", "confidence", "infra", "fisheye")
@@ -52,11 +56,6 @@ class Roles:
 
     topics: Mapping[str, TopicSeen] = field(default_factory=dict)
     why: Mapping[str, str] = field(default_factory=dict)
-
-    def channel(self, role: str) -> Channel | None:
-        """The channel that plays `role`, if any."""
-        seen = self.topics.get(role)
-        return seen.channel if seen else None
 
 
 def peek(reader: LogReader) -> list[TopicSeen]:
@@ -111,7 +110,7 @@ def choose_roles(seen: Sequence[TopicSeen], overrides: Mapping[str, str]) -> Rol
         if role in overrides:
             chosen[role], why[role] = _named(role, overrides[role], seen), "named"
             continue
-        best = _best(seen, lambda topic, role=role: _score(role, topic, chosen))  # type: ignore[misc]
+        best = _best(seen, lambda topic, role=role: _score(role, topic, chosen, seen))  # type: ignore[misc]
         if best is not None:
             chosen[role], why[role] = best, _reason(role, best)
     return Roles(chosen, why)
@@ -120,13 +119,21 @@ def choose_roles(seen: Sequence[TopicSeen], overrides: Mapping[str, str]) -> Rol
 def describe_topics(seen: Sequence[TopicSeen]) -> str:
     """A small table of the log's topics, for messages to people."""
     rows = [
-        (t.channel.topic, t.channel.schema_name or "(no schema)", "?" if t.messages is None else f"{t.messages:,}")
+        (t.channel.topic, _content(t), "?" if t.messages is None else f"{t.messages:,}")
         for t in sorted(seen, key=lambda t: t.channel.topic)
     ]
     shown, wide = rows[:40], [max((len(r[i]) for r in rows[:40]), default=0) for i in range(3)]
     lines = [f"  {topic:<{wide[0]}}  {name:<{wide[1]}}  {count:>{wide[2]}} messages" for topic, name, count in shown]
     more = [f"  ... and {len(rows) - 40} more"] if len(rows) > 40 else []
     return "\n".join([f"The log has {len(rows)} topics", *lines, *more])
+
+
+def _content(topic: TopicSeen) -> str:
+    """Type of a topic, and for images the encoding."""
+    name, message = topic.channel.schema_name or "(no schema)", topic.first
+    if isinstance(message, Image):
+        return f"{name} ({message.encoding})"
+    return f"{name} ({message.format})" if isinstance(message, CompressedImage) and message.format else name
 
 
 def _named(role: str, topic: str, seen: Sequence[TopicSeen]) -> TopicSeen:
@@ -150,24 +157,19 @@ def _named(role: str, topic: str, seen: Sequence[TopicSeen]) -> TopicSeen:
 
 
 def _best(seen: Iterable[TopicSeen], score: Callable[[TopicSeen], float | None]) -> TopicSeen | None:
+    """The topic of the highest score; of equal ones that with most messages, then the alphabetically first."""
     scored = [(s, t) for t in seen if t.refusal is None and (s := score(t)) is not None]
-    if not scored:
-        return None
-    return max(scored, key=lambda st: (st[0], st[1].messages or 0, _reverse(st[1].channel.topic)))[1]
+    return min(scored, key=lambda st: (-st[0], -(st[1].messages or 0), st[1].channel.topic), default=(0.0, None))[1]
 
 
-def _reverse(topic: str) -> tuple[int, ...]:
-    """Sorts so that, all else equal, the alphabetically first topic wins a maximum."""
-    return tuple(-ord(letter) for letter in topic)
-
-
-def _score(role: str, topic: TopicSeen, chosen: Mapping[str, TopicSeen]) -> float | None:
+def _score(role: str, topic: TopicSeen, chosen: Mapping[str, TopicSeen], seen: Sequence[TopicSeen]) -> float | None:
     """How well a topic fits a role; None if it cannot."""
     if topic.kind not in _KINDS[role] or topic.messages == 0 or topic.first is None:
         return None
     name = topic.channel.topic.lower()
     if role == "colour":
-        return _score_colour(topic.first, name)
+        score = _score_colour(topic.first, name)
+        return None if score is None else score + _score_company(topic, seen)
     if role == "depth":
         return _score_depth(topic.first, name, chosen.get("colour"))
     if role in ("colour_info", "depth_info"):
@@ -190,12 +192,40 @@ def _is_depth(message: Message, name: str) -> bool:
 
 
 def _score_colour(message: Message, name: str) -> float | None:
-    if _is_depth(message, name) or (isinstance(message, Image) and message.encoding.lower() not in _COLOUR_ENCODINGS):
+    encoding = message.encoding.lower() if isinstance(message, Image) else "rgb8"
+    if _is_depth(message, name) or encoding not in (*_COLOUR_ENCODINGS, *_RAW_COLOUR_ENCODINGS):
         return None
-    grey = isinstance(message, Image) and message.encoding.lower() in ("mono8", "8uc1")
+    grey, raw = encoding in ("mono8", "8uc1"), encoding in _RAW_COLOUR_ENCODINGS
     score = 4.0 if any(word in name for word in ("color", "colour", "rgb")) else 2.0
-    score -= 2.0 * any(word in name for word in _DEBUG_WORDS) + 1.5 * grey + 1.0 * ("depth" in name)
+    score -= 2.0 * any(word in name for word in _DEBUG_WORDS) + 1.5 * grey + 0.5 * raw
+    score -= 1.0 * ("depth" in name)
     return score + 0.25 * isinstance(message, Image)  # raw before its compressed twin
+
+
+def _score_company(colour: TopicSeen, seen: Sequence[TopicSeen]) -> float:
+    """What speaks for a camera among several: a calibration above all, and depth from the same place."""
+    present = [t for t in seen if t.first is not None and t.refusal is None and t.messages != 0]
+    calibrated = any(t.kind == "camera_info" and _calibrates(t, colour) for t in present)
+    depths = [t for t in present if t.first is not None and _is_depth(t.first, t.channel.topic.lower())]
+    return 3.0 * calibrated + max((_closeness(t, colour) for t in depths), default=0.0)
+
+
+def _calibrates(info: TopicSeen, image: TopicSeen) -> bool:
+    """Whether a calibration stands beside the image, or is given in the same frame."""
+    folder = posixpath.dirname(info.channel.topic)
+    beside = posixpath.dirname(image.channel.topic) == folder
+    above = folder not in ("", "/") and image.channel.topic.startswith(f"{folder}/")
+    return beside or above or _shares_frame(info, image)
+
+
+def _closeness(depth: TopicSeen, colour: TopicSeen) -> float:
+    """1 in the same frame, else up to that with every name at the front that both topics share."""
+    shared = len(posixpath.commonprefix([topic.channel.topic.strip("/").split("/") for topic in (depth, colour)]))
+    return 1.0 if _shares_frame(depth, colour) else min(1.0, 0.2 * shared)
+
+
+def _shares_frame(one: TopicSeen, other: TopicSeen) -> bool:
+    return frame_of(one.first) == frame_of(other.first) != ""
 
 
 def _score_depth(message: Message, name: str, colour: TopicSeen | None) -> float | None:
@@ -213,7 +243,7 @@ def _score_info(topic: TopicSeen, image: TopicSeen | None) -> float | None:
         return None
     parts, wanted = topic.channel.topic.split("/"), image.channel.topic.split("/")
     common = len(posixpath.commonprefix([parts, wanted]))
-    same_frame = bool(topic.first.frame_id) and topic.first.frame_id == frame_of(image.first)
+    same_frame = _shares_frame(topic, image)
     if common < 2 and not same_frame:
         return None
     return common + (1.5 if same_frame else 0.0)

@@ -74,7 +74,7 @@ def read_exactly(handle: BinaryIO, offset: int, length: int) -> bytes:
 
 
 def open_source(path: Path) -> Source:
-    """Check that `path` names a file that can be read and is not empty. Raises SemslamError."""
+    """Check that `path` names a file that can be read; it may be empty. Raises SemslamError."""
     try:
         status = path.stat()
     except OSError as error:
@@ -85,11 +85,16 @@ def open_source(path: Path) -> Source:
         raise SemslamError(
             f"`{path}` is not a regular file", hint="Copy the stream into a file first: MCAP needs seeking"
         )
-    if status.st_size == 0:
-        raise SemslamError(f"`{path}` is empty (0 bytes)", hint="Leave the file out, or copy it again from the robot")
     source = Source(path, status.st_size)
     with source.open():
         return source
+
+
+def empty_file(source: Source) -> SemslamError:
+    """The error for a recording without a single byte."""
+    return SemslamError(
+        f"`{source.path}` is empty (0 bytes)", hint="Leave the file out, or copy it again from the robot"
+    )
 
 
 def not_an_mcap_file(source: Source) -> SemslamError:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 def pack(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     """Named arrays as a compressed npz, in the order given."""
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    buffer, named = io.BytesIO(), dict[str, Any](arrays)
+    np.savez_compressed(buffer, **named)
     return buffer.getvalue()
 
 

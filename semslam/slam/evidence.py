@@ -44,8 +44,12 @@ HALF_WEIGHT_M = 3.0
 OBJECT_SHARE = 2.0
 LARGEST_M = 1e7
 """Poses beyond this are off any map; their observations are left out."""
+LARGEST_CELL = 1 << 30
+"""Nor is a cell beyond this on any map: tables hold 32 bits, and an observation reaches farther than its pose."""
 SNAPSHOT_HALF = 1024
 """A snapshot shows at most this many cells either way of the robot."""
+SNAPSHOT_INDICES = 1 << 32
+"""Numbers that a snapshot's table has for a cell of a class; with very many classes a snapshot shows less."""
 
 _Mask = NDArray[np.bool_]
 _Columns = dict[str, NDArray[Any]]
@@ -100,7 +104,7 @@ class Evidence:
 
     def add(self, planes: Planes, map_from_robot: SE2, stamp_nanos: int) -> bool:
         """Lay one observation (L, side, side) on the map. False if the pose is too far away to be one."""
-        if not (abs(map_from_robot.x_m) < LARGEST_M and abs(map_from_robot.y_m) < LARGEST_M):
+        if not self._holds(map_from_robot):
             return False
         seen = np.asarray(planes[1:].any(0))
         if seen.any():
@@ -109,6 +113,11 @@ class Evidence:
             for tile, window, part in self._tiles_under(patch):
                 _count(tile, window, patch.source[part], seen, sights, self._weight, stamp_nanos)
         return True
+
+    def _holds(self, pose: SE2) -> bool:
+        """Whether a pose is near enough to be one. Not so if it is no number."""
+        largest_m = min(LARGEST_M, LARGEST_CELL * self._cell_m)
+        return abs(pose.x_m) < largest_m and abs(pose.y_m) < largest_m
 
     def _patch(self, map_from_robot: SE2, seen: _Mask) -> _Patch:
         """Map cells that the seen part of an observation may cover, with the observation cell under their middles."""
@@ -145,14 +154,18 @@ class Evidence:
         return {name: column[order] for name, column in whole.items()}
 
     def snapshot(self, around: SE2) -> Snapshot:
-        """The map as it stands, at most `SNAPSHOT_HALF` cells either way of a pose."""
+        """The map as it stands, at most `SNAPSHOT_HALF` cells either way of a pose; empty about one off the map."""
         cells = self.cells()
-        middle_x, middle_y = (math.floor(v / self._cell_m) for v in (around.x_m, around.y_m))
-        near = (np.abs(cells["ix"] - middle_x) <= SNAPSHOT_HALF) & (np.abs(cells["iy"] - middle_y) <= SNAPSHOT_HALF)
+        ix, iy, class_id = (cells[name].astype(np.int64) for name in ("ix", "iy", "class_id"))
+        near = np.zeros(ix.shape, np.bool_)
+        if ix.size and self._holds(around):
+            half = _snapshot_half(int(class_id.max()) + 1)
+            middle_x, middle_y = (math.floor(v / self._cell_m) for v in (around.x_m, around.y_m))
+            near = (np.abs(ix - middle_x) <= half) & (np.abs(iy - middle_y) <= half)
         if not near.any():
             nothing = np.zeros(0, np.int64)
             return Snapshot(0, 0, self._cell_m, 0.0, 0.0, nothing, nothing.astype(np.float32))
-        ix, iy, class_id = (cells[name][near].astype(np.int64) for name in ("ix", "iy", "class_id"))
+        ix, iy, class_id = ix[near], iy[near], class_id[near]
         left, low, columns, rows = ix.min(), iy.min(), int(np.ptp(ix)) + 1, int(np.ptp(iy)) + 1
         flat = (class_id * rows + iy - low) * columns + ix - left
         order = np.argsort(flat)
@@ -180,6 +193,11 @@ class Evidence:
                 getattr(tile, kind)[int(class_id[0])] = array
             else:
                 setattr(tile, kind, array)
+
+
+def _snapshot_half(classes: int) -> int:
+    """Cells either way that a snapshot of so many classes can number."""
+    return min(SNAPSHOT_HALF, (math.isqrt(SNAPSHOT_INDICES // classes) - 1) // 2)
 
 
 def sightings(planes: Planes) -> dict[int, _Mask]:

@@ -38,12 +38,20 @@ def unknown_grey(free_threshold: float, occupied_threshold: float) -> int:
     """The grey value that map_server reads as unknown: 205 by custom, if these thresholds allow it.
 
     map_server takes (255 - grey) / 255 for the occupancy; below `free_threshold` it is free, above
-    `occupied_threshold` occupied. With 205 that is 0.196, so any free threshold above that would turn everything
-    unknown into free floor; the value in the middle between the thresholds is written then.
+    `occupied_threshold` occupied. Free floor is grey 254, 1/255, so the free threshold must be above that; occupied
+    cells are grey 0, which is 1, so the occupied threshold must be below. Grey 205 is 0.196: any free threshold
+    above that would turn everything unknown into free floor; the value in the middle between the thresholds is written
+    then.
 
     Raises:
-        SemslamError: no grey value lies between the thresholds.
+        SemslamError: no grey value lies between the thresholds, or one of them swallows free or occupied cells.
     """
+    if not (free_threshold > (255 - _FREE) / 255 and occupied_threshold < (255 - _OCCUPIED) / 255):
+        raise SemslamError(
+            f"`export.free_threshold` is {free_threshold:g} and `export.occupied_threshold` is {occupied_threshold:g}; "
+            "map_server would read free floor, or objects, as unknown",
+            hint="set `export.free_threshold` above 0.004 and `export.occupied_threshold` below 1",
+        )
     middle = round(255 * (1 - (free_threshold + occupied_threshold) / 2))
     for grey in (_UNKNOWN, middle):
         if free_threshold <= (255 - grey) / 255 <= occupied_threshold:

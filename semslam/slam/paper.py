@@ -16,6 +16,7 @@ bit. (The same products in float32 differ between one and two threads.)
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -37,6 +38,8 @@ Bin = tuple[int, int, int]
 
 WEIGHT_BITS = 20
 """Binary places of observation and map weights, rounding error 5e-7."""
+PATCH_BYTES = 64 << 20
+"""Neighbourhoods gathered at once for equation 2: memory stays bounded for maps of any size."""
 FIELD_BITS = 32
 """Binary places of probabilities in equation 6. Rounding moves no placed weight by more than R H W / 2^33, that is
 5e-5 for 360 x 33 x 33 bins; headings and cells without any probability left are skipped."""
@@ -118,9 +121,8 @@ def correlate(rotated: Planes, world: Planes) -> Scores:
     scores = np.zeros((headings, rows * columns), np.float64)
     for class_id in shared:
         kernel = _whole(rotated[:, class_id].reshape(headings, -1), bits)  # (R, h * h)
-        patches = _patches(_whole(world[class_id], bits), side)  # (h * h, H * W)
-        used = kernel.any(0) & patches.any(1)
-        scores += kernel[:, used] @ patches[used]
+        for cells, bins, patches in _patches(_whole(world[class_id], bits), side, np.flatnonzero(kernel.any(0))):
+            scores[:, bins] += kernel[:, cells] @ patches
     return (scores * 0.25**bits).reshape(headings, rows, columns)
 
 
@@ -134,10 +136,26 @@ def _whole(values: NDArray[np.float32], bits: int) -> NDArray[np.float64]:
     return np.rint(values * np.float64(2**bits))
 
 
-def _patches(plane: NDArray[np.float64], side: int) -> NDArray[np.float64]:
-    """The neighbourhood of every cell, zero beyond the border: (H, W) -> (h * h, H * W)."""
+_Patches = tuple[NDArray[np.int64], slice, NDArray[np.float64]]
+
+
+def _patches(plane: NDArray[np.float64], side: int, used: NDArray[np.int64]) -> Iterator[_Patches]:
+    """The neighbourhood of every cell (H, W), zero beyond the border, in pieces of at most `PATCH_BYTES`.
+
+    Yields K of the `used` of its h * h cells, the map's cells as a slice of H * W, and the values there (K, cells).
+    Neighbours that are zero everywhere are left out. A single row of the map is the smallest piece.
+    """
     windows = sliding_window_view(np.pad(plane, side // 2), plane.shape)  # (h, h, H, W)
-    return windows.reshape(side * side, -1)
+    rows, columns = plane.shape
+    at_once = max(1, PATCH_BYTES // (8 * columns))  # rows of the map, of whatever neighbours
+    height = min(rows, max(1, at_once // max(1, used.size)))
+    for top in range(0, rows, height):
+        bottom = min(rows, top + height)
+        for first in range(0, used.size, max(1, at_once // height)):
+            cells = used[first : first + max(1, at_once // height)]
+            values = windows[cells // side, cells % side, top:bottom].reshape(cells.size, -1)
+            present = values.any(1)
+            yield cells[present], slice(top * columns, bottom * columns), values[present]
 
 
 def visual_field(scores: Scores, temperature: float) -> tuple[Field, float]:

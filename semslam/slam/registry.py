@@ -9,6 +9,8 @@ from semslam.slam.paper_estimator import PaperEstimator
 from semslam.stages.settings import LocalizeConfig
 
 NAMES = ("paper", "paper_visual", "dead_reckoning")
+WITHOUT_MOTION = ("paper_visual",)
+"""Those that never look at the motion."""
 
 
 def open_estimator(name: str, config: LocalizeConfig, classes: tuple[str, ...], cell_m: float, side: int) -> Estimator:

@@ -26,7 +26,8 @@ from semslam.labels import UNOBSERVED
 from semslam.slam.checkpoint import as_array, pack, unpack
 from semslam.slam.estimator import Belief, Estimator, PoseEstimate, Step
 from semslam.slam.evidence import Evidence, Snapshot
-from semslam.slam.registry import open_estimator
+from semslam.slam.health import TrackHealth
+from semslam.slam.registry import WITHOUT_MOTION, open_estimator
 from semslam.stages.contract import FinishedShard, ShardWriter, StageContext, TableSource, row_shards
 from semslam.stages.settings import LocalizeConfig
 from semslam.tables.spec import CELLS, MOTION, OBSERVATIONS, POSES, SNAPSHOTS
@@ -52,7 +53,7 @@ def run(ctx: StageContext) -> None:
                 ctx.progress(done, motion.rows)
             if stop == motion.rows:
                 tables["cells"].append(track.cells())
-            track.warn(shard)
+                track.warn(shard)
             shard.path(_STATE).write_bytes(track.state())
 
 
@@ -67,7 +68,8 @@ class _Track:
         self._evidence = Evidence(self._cell_m, self._side)
         self._last = SE2(0.0, 0.0, 0.0)
         self._half_m = _half_side_m(self._estimator.belief())
-        self._outside = 0
+        self._health = TrackHealth(ctx.variant not in WITHOUT_MOTION)
+        self._outside = self._unmapped = 0
         self.meta = {"classes": list(self._classes), "cell_m": self._cell_m, "estimator": ctx.variant}
 
     @property
@@ -78,6 +80,7 @@ class _Track:
     def step(self, step: Step, shard: ShardWriter) -> PoseEstimate:
         """Estimate the pose, then lay the observation on the map there."""
         estimate = self._estimator.step(step)
+        self._health.see(step, estimate)
         shard.count(f"poses_{estimate.source}")
         if estimate.map_from_robot is None:
             return estimate
@@ -85,6 +88,7 @@ class _Track:
         self._outside += max(abs(self._last.x_m), abs(self._last.y_m)) > self._half_m
         if step.observation is not None and not self._evidence.add(step.observation, self._last, step.stamp_nanos):
             shard.count("observations_off_the_map")
+            self._unmapped += 1
         return estimate
 
     def snapshot(self) -> Snapshot:
@@ -100,26 +104,36 @@ class _Track:
         return {**cells, **centres, "label": labels}
 
     def warn(self, shard: ShardWriter) -> None:
-        """Say how many keyframes since the last call lay off the estimator's own map, where it cannot see."""
+        """Say what was wrong with the track, and how many keyframes lay off the maps."""
+        for warning in self._health.warnings():
+            shard.warn(warning)
+        if self._unmapped:
+            shard.warn(f"{self._unmapped} observations lie too far from the start for any map and were left out of it")
         if self._outside:
             shard.warn(
                 f"{self._outside} keyframes lie outside the map of `{self.meta['estimator']}`, "
                 f"{2 * self._half_m:.1f} m wide about the start; raise `localize.paper.map_side`"
             )
-        self._outside = 0
 
     def state(self) -> bytes:
-        """Estimator, map and last pose."""
+        """Estimator, map, last pose, and what there is to warn of."""
+        parts = {
+            "estimator": self._estimator.state(),
+            "evidence": self._evidence.state(),
+            "health": self._health.state(),
+        }
         last = np.array([self._last.x_m, self._last.y_m, self._last.heading_rad])
-        parts = {"estimator": self._estimator.state(), "evidence": self._evidence.state()}
-        return pack({**{name: as_array(part) for name, part in parts.items()}, "last": last})
+        off_maps = np.array([self._outside, self._unmapped])
+        return pack({**{name: as_array(part) for name, part in parts.items()}, "last": last, "off_maps": off_maps})
 
     def restore(self, shard: FinishedShard) -> None:
         """Go on after a finished shard."""
         arrays = unpack((shard.folder / _STATE).read_bytes())
         self._estimator.restore(arrays["estimator"].tobytes())
         self._evidence.restore(arrays["evidence"].tobytes())
+        self._health.restore(arrays["health"].tobytes())
         self._last = SE2(*arrays["last"].tolist())
+        self._outside, self._unmapped = arrays["off_maps"].tolist()
 
 
 def _steps(

@@ -74,7 +74,7 @@ TOPICS = Table(
         _c("first_log_time_nanos", "int64", "ns", "log time of the first message; null without messages", null=True),
         _c("last_log_time_nanos", "int64", "ns", "log time of the last message; null without messages", null=True),
         _c("max_gap_s", "float64", "s", "longest pause between two messages; null below two messages", null=True),
-        _c("clock_jumps", "uint32", "", "times the header stamp jumped against log time"),
+        _c("clock_jumps", "uint32", "", "times the stamping clock was set; late writing does not count"),
     ),
 )
 
