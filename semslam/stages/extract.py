@@ -225,8 +225,9 @@ def _detection_row(
     points: NDArray[np.float32],
 ) -> Row:
     """One row of the detections table."""
-    usable = mask & (frame.depth_m > 0)
-    span = extent(points[usable])
+    window = _window(mask)
+    usable = mask[window] & (frame.depth_m[window] > 0)
+    span = extent(points[window][usable])
     return {
         "frame": frame.row["frame"],
         "stamp_nanos": frame.row["stamp_nanos"],
@@ -245,6 +246,14 @@ def _detection_row(
         **{f"min_{axis}_m": None if span is None else float(span[0][i]) for i, axis in enumerate("xyz")},
         **{f"max_{axis}_m": None if span is None else float(span[1][i]) for i, axis in enumerate("xyz")},
     }
+
+
+def _window(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """The smallest rectangle of rows and columns that holds a mask; empty for an empty one."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if rows.size == 0:
+        return slice(0, 0), slice(0, 0)
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
 def _frames(batches: Iterator[dict[str, list[Any]]], config: ExtractConfig) -> Iterator[Frame]:

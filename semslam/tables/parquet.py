@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -80,7 +81,7 @@ class TableFileWriter:
         names = [c.name for c in self._table.columns]
         if set(rows) != set(names):
             raise ValueError(f"table {self._table.name}: columns {sorted(set(rows) ^ set(names))} missing or unknown")
-        arrays = [pa.array(rows[c.name], _ARROW[c.type]) for c in self._table.columns]
+        arrays = [_array(rows[c.name], _ARROW[c.type]) for c in self._table.columns]
         for column, array in zip(self._table.columns, arrays, strict=True):
             if array.null_count and not column.null:
                 raise ValueError(f"table {self._table.name}: column {column.name} must not be null")
@@ -163,6 +164,15 @@ class TableFiles:
             for name in names:
                 whole[name] += batch[name]
         return whole
+
+
+def _array(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
+    """A column as Arrow array; lists that are numpy arrays already are joined without a look at every number."""
+    if not pa.types.is_list(kind) or not values or not all(isinstance(value, np.ndarray) for value in values):
+        return pa.array(values, kind)
+    offsets = np.concatenate([[0], np.cumsum([len(value) for value in values])]).astype(np.int32)
+    joined = pa.array(np.concatenate(list(values)), kind.value_type)
+    return pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), joined, kind)
 
 
 def _group_batches(
