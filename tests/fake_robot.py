@@ -5,19 +5,33 @@ from __future__ import annotations
 from dataclasses import replace
 
 from semslam.stages.catalogue import STAGES
-from semslam.stages.contract import StageContext
-from semslam.tables.spec import POSES, TRUTH
+from semslam.stages.contract import LogRefusedError, StageContext
+from semslam.tables.spec import MOTION, POSES, TRUTH
 
 FRAMES = 5
 DRIFT_M = {"paper": 0.1, "paper_visual": 0.3, "dead_reckoning": 0.5}
 
 
 def ingest(ctx: StageContext) -> None:
-    """A robot that drives along x, one metre a keyframe; a log that says `blind` has no truth."""
+    """A robot that drives along x, one metre a keyframe; a log that says `blind` has no truth, `broken` is refused.
+
+    The measured motion slips sideways once and is unknown once.
+    """
+    if b"broken" in ctx.sources[0].read_bytes():
+        raise LogRefusedError("No depth topic")
     with ctx.shard(0) as shard:
         for table in STAGES[0].writes:
-            if table != TRUTH:
+            if table not in (TRUTH, MOTION):
                 shard.table(table)
+        shard.table(MOTION).append(
+            {
+                **_stamps(),
+                "dx_m": [None, 1.0, None, 1.0, 1.0],
+                "dy_m": [None, 0.5, None, 0.0, 0.0],
+                "dheading_rad": [None, 0.0, None, 0.0, 0.0],
+                "source": ["start", "odometry", "none", "odometry", "odometry"],
+            }
+        )
         if b"blind" not in ctx.sources[0].read_bytes():
             zeros = [0.0] * FRAMES
             columns = {"x_m": [float(i) for i in range(FRAMES)], "y_m": zeros, "z_m": zeros, "heading_rad": zeros}

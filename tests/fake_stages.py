@@ -1,6 +1,7 @@
 """Four small stages in the shape of the real ones, for testing whatever runs stages.
 
-A log is a text file. Its first line may hold orders: `refuse`, `bug`, `full`, `kill`, `kill-once`, `warn`, `notes`.
+A log is a text file. Its first line may hold orders: `refuse`, `bug`, `full`, `kill`, `kill-once`, `warn`, `remark`,
+`notes`.
 Every call of a stage appends a line to the file named by SEMSLAM_FAKE_CALLS, from whatever process it runs in.
 """
 
@@ -120,6 +121,8 @@ def first(ctx: StageContext) -> None:
             shard.count("read", stop - start)
             if "warn" in lines[0] and index == 0:
                 shard.warn("a line was strange")
+            if "remark" in lines[0] and index == 0:
+                shard.remark(f"read as {ctx.log}")
             ctx.progress(stop, len(values))
 
 

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import onnx
 import pytest
+from onnx import helper, numpy_helper
 
 from semslam.errors import UsageError
+from semslam.pipeline import plan
 from semslam.pipeline.executors import SerialExecutor
+from semslam.stages.catalogue import STAGES
 from tests.fake_stages import FAKE_STAGES, make_log, with_version
 from tests.pipeline_helpers import World, decisions, states
 
@@ -126,14 +132,47 @@ def test_a_file_in_a_setting_counts_by_its_content(world: World) -> None:
     assert decisions(report)["second"] == "stale: second.model has another content"
 
 
-def test_weights_beside_an_onnx_file_count_too(world: World) -> None:
-    """Exporters put large weights into `X.onnx.data`."""
-    model, data = world.root / "model.onnx", world.root / "model.onnx.data"
-    model.write_text("graph")
-    data.write_text("weights")
-    world.run(f"second.model={model}")
-    data.write_text("other weights")
-    assert decisions(world.run(f"second.model={model}"))["second"] == "stale: second.model has another content"
+def test_weights_outside_an_onnx_file_count_too(world: World) -> None:
+    """Under whatever name the exporter gave them."""
+    for content in (1.0, 2.0):
+        weights = numpy_helper.from_array(np.full(300, content, np.float32), "weights")
+        graph = helper.make_graph([], "empty", [], [], [weights])
+        onnx.save(
+            helper.make_model(graph, ir_version=8, opset_imports=[helper.make_opsetid("", 17)]),
+            world.root / "model.onnx",
+            save_as_external_data=True,
+            size_threshold=0,
+            location="weights.bin",
+        )
+        report = world.run(f"second.model={world.root / 'model.onnx'}")
+    assert decisions(report)["second"] == "stale: second.model has another content"
+    assert "second" in "".join(world.calls())
+    assert set(states(world.run(f"second.model={world.root / 'model.onnx'}")).values()) == {"cached"}
+
+
+def test_another_library_version_or_provider_runs_it_again(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only stages that compute with the library or open a network; the change is explained."""
+    stages = tuple(replace(s, libraries=("numpy", "gone")) if s.name == "second" else s for s in FAKE_STAGES)
+    model = world.root / "model.onnx"
+    model.write_text("weights")
+    world.run(f"second.model={model}", stages=stages)
+    numpy = ".".join(np.__version__.split(".")[:2])
+    assert world.manifest("second")["components"]["libraries"] == {"numpy": numpy, "gone": "absent"}
+    world.calls()
+    monkeypatch.setattr(plan, "library_version", lambda name: {"numpy": "9.1"}.get(name, "absent"))
+    report = world.run(f"second.model={model}", stages=stages)
+    assert world.calls() == ["kitchen second"]
+    assert decisions(report)["second"] == f"stale: numpy {numpy} -> 9.1"
+    monkeypatch.setenv("SEMSLAM_PROVIDER", "CUDAExecutionProvider")
+    report = world.run(f"second.model={model}", stages=stages)
+    assert world.calls() == ["kitchen second"]
+    assert decisions(report)["second"] == "stale: provider auto -> CUDAExecutionProvider"
+
+
+def test_libraries_of_the_real_stages_are_installed() -> None:
+    """A name that no package has would be `absent` for ever and notice nothing."""
+    names = {name for stage in STAGES for name in stage.libraries}
+    assert {name: plan.library_version(name) for name in names if plan.library_version(name) == "absent"} == {}
 
 
 def test_a_missing_file_in_a_setting_is_wrong_use(world: World) -> None:

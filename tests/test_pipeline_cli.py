@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
 import pty
 import re
+import signal
 import struct
 import subprocess
 import sys
 import termios
+import time
 from pathlib import Path
 
 import click
@@ -244,7 +247,9 @@ def test_config_show_and_check(world: World, capsys: Capture) -> None:
         (["run", "a.mcap", "--out", "a.mcap"], "`a.mcap` is a file, not a folder", "--out"),
         (["run", "a.mcap", "--out", "foreign"], "is not empty and no output folder of semslam: it holds `x`", "--out"),
         (["run", "a.mcap", "--out", "newer"], "is of format version 9; this semslam reads version 1", "--out"),
-        (["run", "a.mcap", "--out", "odd"], "unreadable `semslam.json`", "--out"),
+        (["run", "a.mcap", "--out", "odd"], "damaged or unreadable `semslam.json`", "--out"),
+        (["run", "a.mcap", "--out", "text"], "damaged or unreadable `semslam.json`", '"version": 1'),
+        (["clean", "good", "--forget", "b"], "has no log `b`", "semslam status"),
         (["run", "a.mcap", "--out", "new", "--topic", "depth"], "not of the form ROLE=/TOPIC", "depth=/camera/depth"),
         (["run", "a.mcap", "--out", "new", "--set", "first.scale=99"], "`first.scale` must be 1 to 10", "documents"),
         (["run", "a.mcap", "--out", "new", "--config", "none.toml"], "No configuration file", "config show"),
@@ -263,10 +268,12 @@ def test_wrong_use(
     make_log(world.root, "a", numbers=[1])
     (world.root / "foreign").mkdir()
     (world.root / "foreign" / "x").touch()
-    for name, text in (("newer", '{"format": "semslam", "version": 9}'), ("odd", "{"), ("good", "")):
+    marks = {"newer": '{"format": "semslam", "version": 9}', "odd": "{", "good": ""}
+    marks["text"] = '{"format": "semslam", "version": "1"}'
+    for name, text in marks.items():
         (world.root / name).mkdir()
         (world.root / name / "semslam.json").write_text(text or '{"format": "semslam", "version": 1}')
-    if arguments[0] == "why":
+    if arguments[0] in ("why", "clean"):
         world.out = Path("good")
         world.run(names=["a.mcap"], until="first")
         capsys.readouterr()
@@ -318,7 +325,8 @@ def test_verify_finds_every_kind_of_damage(world: World, capsys: Capture) -> Non
         str(second / "manifest.json"): "missing or damaged",
         str(thirds[0] / "extra.txt"): "nobody stored it here",
         str(shard): "missing, damaged or out of order",
-        "kitchen second": "its result is gone; the next run makes it anew",
+        "kitchen first": "its result is gone or damaged; the next run makes it anew",
+        "kitchen second": "its result is gone or damaged; the next run makes it anew",
         str(world.out / "results" / "kitchen" / "lazy" / "map.png"): (
             "differs from the stored result; the next run copies it again"
         ),
@@ -390,12 +398,110 @@ def test_clean_removes_what_nobody_refers_to(world: World, capsys: Capture) -> N
     assert len(world.calls()) == 4
 
 
+def test_a_log_can_be_forgotten(world: World) -> None:
+    """Its record, its results and what only it used; the file itself and what others share stay."""
+    make_log(world.logs, "a")
+    make_log(world.logs, "b", "bug")
+    make_log(world.logs, "twin")
+    world.run()
+    world.calls()
+    assert world.invoke("clean", world.out, "--forget", "a") == 0
+    assert world.invoke("clean", world.out, "--forget", world.logs / "b.mcap") == 0
+    assert sorted(path.name for path in (world.out / "logs").iterdir()) == ["twin.json"]
+    assert [path.name for path in (world.out / "results").iterdir()] == ["twin"]
+    assert (world.logs / "a.mcap").exists()
+    assert world.invoke("verify", world.out) == 0
+    world.run(names=[world.logs / "twin.mcap"])
+    assert world.calls() == []
+
+
+def test_json_errors(world: World, capsys: Capture) -> None:
+    """Whoever asked for JSON gets some, also of an error; the words for people are on stderr as ever."""
+    assert world.invoke("run", world.logs / "none.mcap", "--out", world.out, "--json") == 2
+    shown = capsys.readouterr()
+    error = json.loads(shown.out)["error"]
+    assert error["message"].startswith("No such file or folder")
+    assert error["exit_code"] == 2
+    assert f"hint: {error['hint']}" in shown.err
+    assert world.invoke("status", "--fast", "--json") == 2
+    assert "No such option" in json.loads(capsys.readouterr().out)["error"]["message"]
+
+
+def test_forbidden_is_not_full(world: World, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The hint fits what the system refused."""
+    make_log(world.logs)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(world.out))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    assert world.invoke("run", world.logs, "--out", world.out) == 1
+    shown = capsys.readouterr().err
+    assert f"Permission denied: `{world.out}`" in shown
+    assert "permissions" in shown
+    assert "space" not in shown
+
+
+def test_warnings_of_many_logs_are_one_line(world: World, capsys: Capture) -> None:
+    """With a count, and the first who said it."""
+    for name, number in (("a", 1), ("b", 2), ("c", 3)):
+        make_log(world.logs, name, "warn", numbers=[number])
+    assert world.invoke("run", world.logs, "--out", world.out, "--workers", 0) == 0
+    shown = capsys.readouterr().err
+    assert shown.count("a line was strange") == 1
+    assert "warning: `a` first and 2 more: a line was strange" in shown
+
+
+def test_remarks_of_the_first_logs_are_shown(world: World, capsys: Capture) -> None:
+    """With many logs the rest is counted."""
+    for number in range(5):
+        make_log(world.logs, f"log{number}", "remark", numbers=[number])
+    assert world.invoke("run", world.logs, "--out", world.out, "--workers", 0) == 0
+    notes = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note: ")]
+    assert notes == [
+        *(f"note: `log{number}` first: read as log{number}" for number in range(3)),
+        "note: and those of 2 more logs; `--json` lists them",
+    ]
+
+
+def test_an_interrupt_at_any_moment_leaves_no_traceback(world: World) -> None:
+    """Not from this process, nor from workers that are just starting."""
+    make_log(world.logs, numbers=range(40))
+    code = (
+        "import sys; from tests.fake_stages import FAKE_STAGES\n"
+        "from semslam.pipeline.cli import main\n"
+        "print('ready', flush=True)\n"
+        f"main(['run', {str(world.logs)!r}, '--out', {str(world.out)!r}, '--workers', '2', '--set',"
+        " 'first.pause_s=0.2'], stages=FAKE_STAGES)"
+    )
+    script = world.root / "script.py"
+    script.write_text(f"if __name__ == '__main__':\n    exec({code!r})\n")
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    for delay_s in (0.02, 0.15, 0.3):
+        process = subprocess.Popen(
+            [sys.executable, str(script)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment,
+            start_new_session=True,
+        )
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(delay_s)
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=20)
+        assert process.returncode == 130
+        assert "Traceback" not in said
+        assert "interrupted: run the same command again" in said
+
+
 def test_split_recordings_are_announced(world: World, capsys: Capture) -> None:
     """So that nobody is surprised by their being one log."""
     make_log(world.logs, "home_0", numbers=[1, 2])
     make_log(world.logs, "home_1", "3", numbers=[4])
     assert world.invoke("run", world.logs, "--out", world.out, "--workers", 0) == 0
-    assert "`home` is a recording in 2 files" in capsys.readouterr().err
+    assert "`home` is a recording in 2 files, `home_0.mcap` to `home_1.mcap`" in capsys.readouterr().err
     assert (world.out / "results" / "home" / "hasty" / "map.png").read_text() == "map home hasty [2, 8, 20, 40]"
 
 

@@ -97,6 +97,8 @@ def test_set_reads_what_people_type(assignment: str, key: str, value: object) ->
         ('[localize]\nestimators = ["best"]\n', '`localize.estimators` cannot be `"best"`', "`dead_reckoning`"),
         ("[localize]\nestimators = []\n", "`localize.estimators` is empty", "leave `estimators` out"),
         ('[localize]\nestimators = ["paper", "paper"]\n', "names `paper` twice", "once"),
+        ("[extract]\nside = 98\n", "`extract.side` is 98", "extract.side=99"),
+        ("[extract]\nmin_depth_m = 6\n", "`extract.min_depth_m` is 6 and `extract.max_depth_m` is 6", "max_depth_m=11"),
         ("[extract\n", "is no TOML", "semslam config show"),
     ],
 )

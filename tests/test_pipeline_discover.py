@@ -61,6 +61,23 @@ def test_numbers_that_do_not_start_at_zero_are_names(tmp_path: Path) -> None:
     assert found(tmp_path) == {"kitchen": ["kitchen_01.mcap", "kitchen_02.mcap"]}
 
 
+def test_missing_parts_are_named(tmp_path: Path) -> None:
+    """Between those that are there, and before the first of what rosbag2 recorded; plain names warn of nothing."""
+    touch(*(tmp_path / f"r_{number}.mcap" for number in (0, 2, 5)), tmp_path / "day_3.mcap", tmp_path / "day_7.mcap")
+    apart = "; they are taken as 3 logs"
+    assert discover([str(tmp_path)]).warnings == (
+        f"`r_1.mcap` is missing between `r_0.mcap` and `r_2.mcap`{apart}",
+        f"`r_3.mcap` to `r_4.mcap` are missing between `r_2.mcap` and `r_5.mcap`{apart}",
+    )
+    assert discover([str(tmp_path / "day_*.mcap")]).warnings == ()
+    other = tmp_path / "bag"
+    touch(other / "r_01.mcap", other / "r_03.mcap", other / "metadata.yaml")
+    assert discover([str(other)]).warnings == (
+        "`r_00.mcap` is missing before `r_01.mcap`",
+        "`r_02.mcap` is missing between `r_01.mcap` and `r_03.mcap`",
+    )
+
+
 def test_a_part_named_alone_is_a_log_alone(tmp_path: Path) -> None:
     """Also one that lies in a folder alone."""
     touch(tmp_path / "kitchen_0.mcap", tmp_path / "kitchen_1.mcap")

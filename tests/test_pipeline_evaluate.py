@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
 
+from semslam.geometry.frames import SE2
 from semslam.pipeline.cli import run_command
+from semslam.pipeline.evaluate import compose
+from semslam.slam.dead_reckoning import DeadReckoning
+from semslam.slam.estimator import Step
 from semslam.tables.parquet import TableFiles
 from semslam.tables.spec import EVALUATION
 from tests.fake_robot import ROBOT_STAGES
@@ -50,7 +55,49 @@ def test_the_table_for_people(world: World, capsys: Capture) -> None:
     lines = [line.split() for line in shown.out.splitlines()]
     assert lines[0] == ["LOG", "ESTIMATOR", "FRAMES", "COVERAGE", "APE", "DE", "WORST", "APE", "WORST", "DE"]
     assert lines[1] == ["a", "paper", "5", "80.0%", "0.150", "m", "0.00", "deg", "0.300", "m", "0.00", "deg"]
-    assert lines[7] == ["mean", "of", "2", "paper", "10", *lines[1][3:]]
+    assert lines[9] == ["mean", "of", "2", "paper", "10", *lines[1][3:]]
+
+
+def test_dead_reckoning_is_there_without_being_run(world: World, capsys: Capture) -> None:
+    """Composed from the measured motion: frames at x 0, 1, -, 2, 3 and y 0, 0.5, -, 0.5, 0.5, the truth at x 0 to 4."""
+    make_log(world.logs, "a")
+    world.run("localize.estimators=paper", stages=ROBOT_STAGES, until="localize")
+    assert run_command(["evaluate", str(world.out), "--json"], ROBOT_STAGES) == 0
+    scores = {score["estimator"]: score for score in json.loads(capsys.readouterr().out)["scores"]}
+    assert list(scores) == ["paper", "dead_reckoning", "chance", "standstill"]
+    found = scores["dead_reckoning"]
+    assert found["coverage"] == 0.8
+    assert found["ape_m"] == pytest.approx((0 + 0.5 + 2 * math.hypot(1, 0.5)) / 4)
+    assert found["ape_worst_m"] == pytest.approx(math.hypot(1, 0.5))
+
+
+def test_the_track_composed_here_is_that_of_the_estimator() -> None:
+    """Turns and unknown steps included."""
+    motions = [None, SE2(1.0, 0.2, 0.3), None, SE2(0.5, -0.1, -2.0), SE2(-0.3, 0.0, 1.0)]
+    columns = {name: [getattr(m, name[1:]) if m else None for m in motions] for name in ("dx_m", "dy_m")}
+    columns["dheading_rad"] = [m.heading_rad if m else None for m in motions]
+    frames = list(range(len(motions)))
+    track = compose({"frame": frames, "stamp_nanos": frames, **columns})
+    estimator = DeadReckoning()
+    poses = [estimator.step(Step(frame, frame, None, motion)).map_from_robot for frame, motion in enumerate(motions)]
+    assert track.frames.tolist() == [frame for frame, pose in enumerate(poses) if pose]
+    known = [pose for pose in poses if pose]
+    assert track.x_m.tolist() == [pose.x_m for pose in known]
+    assert track.y_m.tolist() == [pose.y_m for pose in known]
+    assert track.heading_rad.tolist() == [pose.heading_rad for pose in known]
+
+
+def test_a_failed_log_is_called_failed(world: World, capsys: Capture) -> None:
+    """Not one without ground truth, and not by what an earlier run left of it."""
+    path = make_log(world.logs, "a")
+    make_log(world.logs, "b", numbers=[1])
+    world.run("localize.estimators=paper", stages=ROBOT_STAGES, until="localize")
+    path.write_text("broken")
+    world.run("localize.estimators=paper", stages=ROBOT_STAGES, until="localize")
+    assert run_command(["evaluate", str(world.out), "--json"], ROBOT_STAGES) == 0
+    shown = capsys.readouterr()
+    assert shown.err == "warning: ingest of `a` failed: No depth topic\n"
+    assert {score["log"] for score in json.loads(shown.out)["scores"]} == {"b"}
 
 
 def test_without_truth_there_is_nothing_to_compare(world: World, capsys: Capture) -> None:

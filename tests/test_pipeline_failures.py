@@ -7,12 +7,14 @@ import json
 import os
 import shutil
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from semslam.errors import SemslamError
-from semslam.pipeline.cache import SHARD, WORK
+from semslam.pipeline.cache import SHARD, WORK, Work
 from semslam.pipeline.config import load_config
 from semslam.pipeline.console import Console, RunView
 from semslam.pipeline.context import Context
@@ -50,7 +52,7 @@ def test_a_failure_is_kept_in_the_record_and_tried_again(world: World) -> None:
     world.run()
     record = json.loads((world.out / "logs" / "bad.json").read_text())
     assert record["tasks"]["first"]["failure"]["message"] == "No depth topic in `bad`"
-    assert decisions(world.run())["first"] == "failed before: No depth topic in `bad`"
+    assert decisions(world.run())["first"] == "try again (failed before: No depth topic in `bad`)"
     path.write_text("plain\n1\n")
     assert states(world.run())["bad first"] == "done"
     assert "failure" not in json.loads((world.out / "logs" / "bad.json").read_text())["tasks"]["first"]
@@ -210,20 +212,78 @@ def test_the_decision_tells_how_much_is_there(world: World, monkeypatch: pytest.
     assert decisions(world.run(until="first"))["first"] == "resume (2 shards)"
 
 
-def test_an_input_damaged_in_the_cache_is_not_read(world: World) -> None:
-    """The stage that would read it fails and names the file; verify --remove makes room for a new one."""
+def _flip(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[-9] ^= 1
+    path.write_bytes(content)
+
+
+def _stored(world: World, stage: str, name: str) -> Path:
+    return next((world.out / "cache" / stage).glob(f"*/shard-00000/{name}"))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_damaged_input_is_made_again_in_the_same_run(world: World, workers: int) -> None:
+    """Two flipped bytes, one behind the other: both entries are dropped and made anew, and the task goes on."""
+    make_log(world.logs)
+    make_log(world.logs, "twin")
+    world.run(until="second")
+    before = world.entries()
+    world.calls()
+    _flip(_stored(world, "first", "numbers.parquet"))
+    _flip(_stored(world, "second", "sums.parquet"))
+    assert world.invoke("run", world.logs, "--out", world.out, "--workers", workers, "--quiet") == 0
+    calls = world.calls()
+    assert calls.count("kitchen first") == 1
+    assert {name: content for name, content in world.entries().items() if name in before} == before
+    assert world.invoke("verify", world.out) == 0
+
+
+def test_the_table_counts_what_was_made_again(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    """Once, as done."""
     make_log(world.logs)
     world.run(until="first")
-    table = next((world.out / "cache" / "first").glob("*/shard-00001/numbers.parquet"))
-    content = bytearray(table.read_bytes())
-    content[-9] ^= 1
-    table.write_bytes(content)
+    _flip(_stored(world, "first", "numbers.parquet"))
+    assert world.invoke("run", world.logs, "--out", world.out, "--workers", 0) == 0
+    shown = capsys.readouterr().err
+    assert "kitchen first: stored result damaged, dropped" in shown
+    assert ["first", "0", "0", "0", "1", "0", "10"] in [line.split()[:7] for line in shown.splitlines()]
+    assert ["second", "0", "0", "0", "1", "0", "10"] in [line.split()[:7] for line in shown.splitlines()]
+
+
+def test_an_input_that_stays_damaged_fails(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is made again once; then the failure names the file and what to type, with the real folder."""
+    make_log(world.logs)
+    finish = Work.finish
+
+    def spoiled(self: Work, manifest: Mapping[str, Any]) -> bool:
+        if manifest["stage"] == "first":
+            _flip(self.folder / "shard-00000" / "numbers.parquet")
+        return finish(self, manifest)
+
+    monkeypatch.setattr(Work, "finish", spoiled)
     (failed,) = world.run().failures
+    assert world.calls().count("kitchen first") == 2
     assert failed.failure is not None
-    assert str(table) in failed.failure.message
-    assert "--remove" in failed.failure.hint
-    assert world.invoke("verify", world.out, "--remove") == 1
-    assert states(world.run())["kitchen last/hasty"] == "done"
+    assert str(_stored(world, "first", "numbers.parquet")) in failed.failure.message
+    assert f"semslam verify {world.out} --remove" in failed.failure.hint
+
+
+@pytest.mark.parametrize("how", ["missing", "cut"])
+def test_a_file_gone_from_the_cache_is_made_again(world: World, how: str) -> None:
+    """Even if nothing else changed, and without making what depends on it."""
+    make_log(world.logs)
+    world.run()
+    before = world.entries()
+    world.calls()
+    table = _stored(world, "first", "numbers.parquet")
+    if how == "missing":
+        table.unlink()
+    else:
+        table.write_bytes(table.read_bytes()[:-1])
+    assert decisions(world.run())["first"] == "run (its result is gone or damaged)"
+    assert world.calls() == ["kitchen first"]
+    assert world.entries() == before
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,7 @@ MANIFEST = "manifest.json"
 TIMING = "timing.json"
 SHARD = "shard.json"
 WORK = ".work-"
+_INDEX_VERSION = 2
 _LOCK_WAIT_S = 20.0
 _LOCK_POLL_S = 0.05
 
@@ -69,6 +70,7 @@ class Entry:
         tables: digest by table name; an optional table that was not written is missing.
         rows: number of rows by table name.
         files: SHA-256 of the files that are no tables, by name.
+        sizes: bytes of every stored file, by its path within the entry.
     """
 
     stage: str
@@ -79,6 +81,7 @@ class Entry:
     counters: Mapping[str, int]
     warnings: tuple[str, ...]
     remarks: tuple[str, ...]
+    sizes: Mapping[str, int]
 
     @classmethod
     def of(cls, manifest: Mapping[str, Any]) -> Entry:
@@ -93,6 +96,7 @@ class Entry:
             manifest["counters"],
             tuple(manifest["warnings"]),
             tuple(manifest["remarks"]),
+            {file["file"]: file["bytes"] for file in stored_files(manifest)},
         )
 
     @classmethod
@@ -108,19 +112,21 @@ class Entry:
 class EntryIndex:
     """Summaries of entries, kept in one file so that a plan need not open thousands of manifests.
 
-    A summary counts only while the stamp of its manifest is the one it was made from; entries never change, so that is
-    true until somebody removes or repairs one by hand. The file may be deleted at any time.
+    A summary counts only while the stamp of its manifest is the one it was made from and every stored file is there
+    with its size; entries never change, so that is true until somebody or some disk meddles with one. Contents are
+    compared by whoever reads them. The file may be deleted at any time.
     """
 
     def __init__(self, cache: Path) -> None:
         self._cache = cache
         self._file = cache / "index.json"
         stored = read_json(self._file)
-        self._known: dict[str, dict[str, Any]] = stored if isinstance(stored, dict) else {}
+        known = isinstance(stored, dict) and stored.get("version") == _INDEX_VERSION
+        self._known: dict[str, dict[str, Any]] = stored["entries"] if known else {}
         self._changed = False
 
     def find(self, stage: str, key: str) -> Entry | None:
-        """The entry if it is there; None if not, or if its manifest is damaged."""
+        """The entry if it is there; None if not, if its manifest is damaged, or if a file is missing or cut."""
         name = f"{stage}/{key}"
         try:
             stamp = FileStamp.of(f"{self._cache}/{name}/{MANIFEST}").as_list()
@@ -136,7 +142,8 @@ class EntryIndex:
             known = {"stamp": stamp, "entry": Entry.of(manifest).as_json()}
             self._known[name] = known
             self._changed = True
-        return Entry.from_json(known["entry"])
+        entry = Entry.from_json(known["entry"])
+        return entry if _all_there(f"{self._cache}/{name}", entry.sizes) else None
 
     def prune(self) -> None:
         """Drop summaries of entries that are gone."""
@@ -146,8 +153,35 @@ class EntryIndex:
     def save(self) -> None:
         """Write the file if anything is new."""
         if self._changed:
-            write_json(self._file, self._known)
+            write_json(self._file, {"version": _INDEX_VERSION, "entries": self._known})
             self._changed = False
+
+
+def stored_files(manifest: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """What a manifest says of every file of its entry: tables, then the others."""
+    return [*(file for table in manifest["tables"].values() for file in table["shards"]), *manifest["files"]]
+
+
+def _all_there(folder: str, sizes: Mapping[str, int]) -> bool:
+    """Whether every file of an entry exists with its size."""
+    try:
+        return all(os.stat(f"{folder}/{name}").st_size == size for name, size in sizes.items())
+    except OSError:
+        return False
+
+
+def _usable(folder: Path) -> bool:
+    """Whether the entry in `folder` has a good manifest and all its files."""
+    manifest = load_manifest(folder)
+    return manifest is not None and _all_there(str(folder), Entry.of(manifest).sizes)
+
+
+class DamagedEntryError(SemslamError):
+    """A stored entry is damaged or incomplete: it has to be made again."""
+
+    def __init__(self, message: str, *, hint: str = "", details: str = "", entry: Path = Path()) -> None:
+        super().__init__(message, hint=hint, details=details)
+        self.entry = entry
 
 
 def load_manifest(folder: Path) -> dict[str, Any] | None:
@@ -166,9 +200,10 @@ def table_files(folder: Path) -> dict[str, tuple[InputFile, ...]]:
     """
     manifest = load_manifest(folder)
     if manifest is None:
-        raise SemslamError(
+        raise DamagedEntryError(
             f"Stored entry `{folder}` is damaged: its `{MANIFEST}` cannot be read",
             hint="run the same command again; it makes the entry anew",
+            entry=folder,
         )
     return {
         name: tuple(InputFile(str(folder / part["file"]), part["sha256"]) for part in table["shards"])
@@ -269,10 +304,10 @@ class Work:
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
-            if load_manifest(self._target) is not None:
+            if _usable(self._target):
                 remove(self.folder)
                 return False
-            remove(self._target)  # its manifest is damaged: nobody can use it, and it stands in the way
+            remove(self._target)  # it is damaged: nobody can use it, and it stands in the way
             self.folder.rename(self._target)
         sync(self._target.parent)
         return True

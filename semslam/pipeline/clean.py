@@ -1,11 +1,13 @@
 """Remove what no log of the output folder refers to any more, and what interrupted runs left behind.
 
 Goes: entries whose key is in no record, work folders, temporary files, results of logs or variants without a record.
-With `everything`, all entries and records go; `results` stays.
+With `everything`, all entries and records go; `results` stays. With `forget`, one log goes: its record, its
+results, and what only it referred to.
 """
 
 from __future__ import annotations
 
+import glob
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +19,7 @@ from semslam.pipeline.digest import DigestCache
 from semslam.pipeline.files import TEMPORARY, remove, size_bytes
 from semslam.pipeline.folder import OutputFolder
 from semslam.pipeline.record import load_records
+from semslam.pipeline.why import find_record
 
 
 @dataclass(frozen=True)
@@ -43,9 +46,14 @@ class CleanReport:
         return "\n".join([*lines, f"{verb} {len(self.removed)} items, {bytes_text(self.total_bytes)}"])
 
 
-def clean(folder: OutputFolder, *, everything: bool = False, dry_run: bool = False) -> CleanReport:
-    """Clean the folder, which must be locked."""
-    chosen = [(path, size_bytes(path)) for path in _removable(folder, everything)]
+def clean(folder: OutputFolder, *, everything: bool = False, dry_run: bool = False, forget: str = "") -> CleanReport:
+    """Clean the folder, which must be locked.
+
+    Raises:
+        UsageError: there is no log `forget`.
+    """
+    forgotten = find_record(folder, forget).name if forget else ""
+    chosen = [(path, size_bytes(path)) for path in _removable(folder, everything, forgotten)]
     if not dry_run:
         for path, _ in chosen:
             remove(path)
@@ -53,8 +61,11 @@ def clean(folder: OutputFolder, *, everything: bool = False, dry_run: bool = Fal
     return CleanReport(tuple(chosen), dry_run)
 
 
-def _removable(folder: OutputFolder, everything: bool) -> Iterator[Path]:
+def _removable(folder: OutputFolder, everything: bool, forgotten: str) -> Iterator[Path]:
     records = {} if everything else load_records(folder.logs)
+    if records.pop(forgotten, None) is not None:
+        yield folder.logs / f"{forgotten}.json"
+        yield from sorted(folder.logs.glob(f"{glob.escape(forgotten)}.*.traceback.txt"))
     used = {(task.split("/")[0], one.key) for record in records.values() for task, one in record.tasks.items()}
     for entry in entry_folders(folder.cache):
         if (entry.parent.name, entry.name) not in used:

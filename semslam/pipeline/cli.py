@@ -5,6 +5,7 @@ Exit codes: 0 done, 1 something failed, 2 wrong use, 130 interrupted. Data goes 
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -21,6 +22,7 @@ from semslam.pipeline.threads import ONE_THREAD
 
 if TYPE_CHECKING:
     from semslam.pipeline.console import Console
+    from semslam.pipeline.discover import Log
     from semslam.stages.check import CheckReport
     from semslam.stages.contract import Stage
 
@@ -31,9 +33,14 @@ _MODEL_OPTIONS = ("detector", "classes", "segmenter_encoder", "segmenter_decoder
 
 def main(arguments: Sequence[str] | None = None, stages: Sequence[Stage] | None = None) -> NoReturn:
     """Run the command line and exit; `stages` replaces the catalogue."""
-    os.environ.update(ONE_THREAD)  # before numpy is imported, which reads them once
-    signal.signal(signal.SIGTERM, _interrupt)
-    sys.exit(run_command(arguments, stages))
+    try:
+        os.environ.update(ONE_THREAD)  # before numpy is imported, which reads them once
+        signal.signal(signal.SIGTERM, _interrupt)
+        code = run_command(arguments, stages)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is said; what is left is to end
+    except KeyboardInterrupt:  # while an error was being told
+        code = INTERRUPTED
+    sys.exit(code)
 
 
 def _interrupt(*_: object) -> None:
@@ -42,6 +49,7 @@ def _interrupt(*_: object) -> None:
 
 def run_command(arguments: Sequence[str] | None, stages: Sequence[Stage] | None) -> int:
     """Run, and turn whatever is thrown into a message and an exit code."""
+    as_json = "--json" in (sys.argv[1:] if arguments is None else arguments)
     try:
         result = cli.main(arguments, prog_name="semslam", standalone_mode=False, obj=stages)
         return result if isinstance(result, int) else 0
@@ -49,21 +57,45 @@ def run_command(arguments: Sequence[str] | None, stages: Sequence[Stage] | None)
         _complain("interrupted: run the same command again to resume")
         return INTERRUPTED
     except SemslamError as error:
-        _console().error(error)
-        return error.exit_code
+        return _tell(error, as_json)
     except click.ClickException as error:
-        _console().error(UsageError(error.format_message(), hint=_click_hint(error)))
-        return 2
+        return _tell(UsageError(error.format_message(), hint=_click_hint(error)), as_json)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nobody reads; nothing is left to say
         return 1
     except OSError as error:
-        from semslam.pipeline.files import out_of_space
+        return _tell(_plain_words(error), as_json)
 
-        what = "No space left" if out_of_space(error) else error.strerror or str(error)
-        where = f": `{error.filename}`" if error.filename else ""
-        _console().error(SemslamError(f"{what}{where}", hint="free some space or check the permissions"))
-        return 1
+
+def _tell(error: SemslamError, as_json: bool) -> int:
+    """Say it to people, and on stdout to machines that wait for JSON there; the exit code."""
+    _console().error(error)
+    if as_json:
+        _print_json({"error": _error_json(error)})
+    return error.exit_code
+
+
+def _error_json(error: SemslamError) -> dict[str, Any]:
+    return {
+        "message": error.message,
+        "hint": error.hint,
+        "details": error.details,
+        "exit_code": error.exit_code,
+    }
+
+
+def _plain_words(error: OSError) -> SemslamError:
+    """What the system refused, with a hint that fits."""
+    from semslam.pipeline.files import out_of_space
+
+    where = f": `{error.filename}`" if error.filename else ""
+    if out_of_space(error):
+        return SemslamError(f"No space left{where}", hint="free some space, then run the same command again")
+    if isinstance(error, PermissionError) or error.errno == errno.EROFS:
+        hint = "look at the permissions with `ls -ld`, or name another folder with `--out`"
+    else:
+        hint = "check the path and the disk it lies on"
+    return SemslamError(f"{error.strerror or error}{where}", hint=hint)
 
 
 def _click_hint(error: click.ClickException) -> str:
@@ -310,7 +342,7 @@ def export(context: click.Context, /, **given: Any) -> int:
 def evaluate(out: Path, as_json: bool) -> None:
     """Compare all tracks with ground truth.
 
-    Stands beside them: `chance` (random poses) and `standstill` (no motion at all).
+    Stands beside them: `dead_reckoning` (motion alone), `chance` (random poses) and `standstill` (no motion at all).
 
     \b
     Example:
@@ -403,12 +435,14 @@ def verify(context: click.Context, out: Path, rederive: bool, remove: bool, work
 @cli.command()
 @_out_argument
 @click.option("--all", "everything", is_flag=True, help="All entries and records; only results stay.")
+@click.option("--forget", default="", metavar="LOG", help="Also forget this log: its record and its results.")
 @click.option("--dry-run", is_flag=True, help="Only say what would be removed.")
 @_json_option
-def clean(out: Path, everything: bool, dry_run: bool, as_json: bool) -> None:
+def clean(out: Path, everything: bool, forget: str, dry_run: bool, as_json: bool) -> None:
     """Remove what no log refers to any more.
 
-    Entries that no log uses, unfinished work, temporary files, results of logs and variants that are gone.
+    Entries that no log uses, unfinished work, temporary files, results of logs and variants that are gone. The log
+    files themselves are never touched.
 
     \b
     Example:
@@ -419,7 +453,7 @@ def clean(out: Path, everything: bool, dry_run: bool, as_json: bool) -> None:
 
     folder = open_folder(out)
     with folder.locked():
-        report = clean_folder(folder, everything=everything, dry_run=dry_run)
+        report = clean_folder(folder, everything=everything, dry_run=dry_run, forget=forget)
     _print(report, as_json)
 
 
@@ -457,15 +491,18 @@ def config_show(context: click.Context, /, defaults: bool, **given: Any) -> None
 @click.argument("file", type=click.Path(path_type=Path))
 @click.pass_context
 def config_check(context: click.Context, file: Path) -> None:
-    """Check a configuration file: keys, types, ranges, and that the files it names exist.
+    """Check a configuration file: keys, types, ranges, and that the files it names exist and will do.
 
     \b
     Example:
       semslam config check home.toml
     """
     from semslam.pipeline.config import check_files, load_config
+    from semslam.pipeline.preflight import check_stages
 
-    check_files(load_config(_stages(context), file))
+    loaded = load_config(_stages(context), file)
+    check_files(loaded)
+    check_stages(loaded, _stages(context), detector_later=True)
     click.echo(f"{file}: ok")
 
 
@@ -506,31 +543,62 @@ def _demo_log(path: Path, console: Console) -> Path:
 
 
 def _check(context: click.Context, given: Mapping[str, Any]) -> int:
-    """`ingest --check`: a report and a picture for every log; 1 if one will not do."""
+    """`ingest --check`: a report and a picture for every log; 1 if one will not do or cannot be told."""
     from semslam.pipeline.config import load_config
     from semslam.pipeline.discover import discover
-    from semslam.stages.check import check_log
+    from semslam.pipeline.preflight import check_stages
 
     stages = _stages(context)
     resolved = load_config(stages, given["config_file"], given["assignments"], _settings(given))
+    check_stages(resolved, stages[:1])
     found = discover(given["logs"])
+    for warning in found.warnings:
+        _console().warn(warning)
     explicit = context.get_parameter_source("out") == click.core.ParameterSource.COMMANDLINE
-    beside = given["out"].parent if explicit else Path()
-    reports: list[CheckReport] = []
-    failed = bool(found.problems)
+    pictures = given["out"] if explicit else Path()
+    told: list[CheckReport | SemslamError] = []
+    errors = [SemslamError(f"`{problem.path}` was left out: {problem.reason}") for problem in found.problems]
     for log in found.logs:
-        try:
-            reports.append(check_log(log.sources, resolved.of(stages[0]).topics, beside / f"{log.name}.check.png"))
-        except SemslamError as error:
-            _console().error(error)
-            failed = True
+        report, problem = _check_one(log, resolved.of(stages[0]), pictures)
+        told += [report] if report else [problem] if problem else []
+        errors += [problem] if problem else []
+    reports = [one for one in told if not isinstance(one, SemslamError)]
     if given["as_json"]:
-        _print_json([report.as_json() for report in reports])
+        _print_json([{"error": _error_json(x)} if isinstance(x, SemslamError) else x.as_json() for x in told])
     elif reports:
         click.echo("\n\n".join(report.text() for report in reports))
-    for problem in found.problems:
-        _console().error(SemslamError(f"`{problem.path}` was left out: {problem.reason}"))
-    return 0 if all(report.ok for report in reports) and not failed else 1
+    for error in errors:
+        _console().error(error)
+    return 0 if all(report.ok for report in reports) and not errors else 1
+
+
+def _check_one(log: Log, config: Any, pictures: Path) -> tuple[CheckReport | None, SemslamError | None]:
+    """The report of one log and what went wrong; a picture that cannot be put in place does not cost the report."""
+    import shutil
+    import tempfile
+    from dataclasses import replace
+
+    from semslam.pipeline.folder import CHECK_PICTURE
+    from semslam.stages.check import check_log
+
+    name = f"{log.name}{CHECK_PICTURE}"
+    try:
+        with tempfile.TemporaryDirectory(prefix="semslam-") as temporary:
+            report = check_log(log.sources, config, Path(temporary, name))
+            if report.picture is None:
+                return report, None
+            try:
+                pictures.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(report.picture, pictures / name)
+            except OSError as error:
+                problem = SemslamError(
+                    f"Picture `{pictures / name}` cannot be written: {error.strerror}",
+                    hint="name another folder with `--out`",
+                )
+                return replace(report, picture=None), problem
+            return replace(report, picture=str(pictures / name)), None
+    except SemslamError as error:
+        return None, error
 
 
 if __name__ == "__main__":

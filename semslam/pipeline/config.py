@@ -23,6 +23,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 from semslam.errors import UsageError
 from semslam.pipeline.files import canonical_json
 from semslam.stages.contract import Stage
+from semslam.stages.settings import ExtractConfig
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,7 @@ def load_config(
     config = Config({stage.name: _build(stage.config, values[stage.name]) for stage in stages})
     for stage in stages:
         _check_variants(stage, config)
+        _check_across(config.of(stage))
     return config
 
 
@@ -265,6 +267,23 @@ def _check_variants(stage: Stage, config: Config) -> None:
     doubled = sorted({name for name in names if names.count(name) > 1})
     if doubled:
         raise UsageError(f"`{key}` names `{doubled[0]}` twice", hint="name each once")
+
+
+def _check_across(section: Any) -> None:
+    """Settings of a section that are fine alone and make no sense together."""
+    if not isinstance(section, ExtractConfig):
+        return
+    if section.min_depth_m >= section.max_depth_m:
+        raise UsageError(
+            f"`extract.min_depth_m` is {section.min_depth_m:g} and `extract.max_depth_m` is {section.max_depth_m:g}, "
+            "which leaves no depth between them",
+            hint=f"raise the second, such as `--set extract.max_depth_m={section.min_depth_m + 5:g}`",
+        )
+    if section.side % 2 == 0:
+        raise UsageError(
+            f"`extract.side` is {section.side}, but the camera stands at the centre of the middle cell",
+            hint=f"use an odd number: `--set extract.side={section.side + 1}`",
+        )
 
 
 def _nearest(

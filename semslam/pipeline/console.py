@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 MAX_LINES = 20
 """Warnings and failures shown at the end; the rest is counted."""
+REMARKED_LOGS = 3
+"""Logs whose remarks are shown at the end."""
 _LINE_PERIOD_S = 10.0
 _COLOURS = {"red": "31", "yellow": "33", "green": "32", "bold": "1"}
 
@@ -133,6 +135,19 @@ class RunView:
             stage.units += self._last.get(key, 0) - (self._first.get(key, 0) if result.resumed else 0)
         self._progress.settled(key, result)
 
+    def reopened(self, result: TaskResult) -> None:
+        """A settled task is to run again."""
+        stage = self._stages[result.task.stage.name]
+        stage.states[result.state] -= 1
+        stage.rows -= sum(result.entry.rows.values()) if result.entry else 0
+        self._progress.reopened(result)
+
+    def withdrawn(self, task: Task) -> None:
+        """A running task waits again."""
+        self._running.remove(_key(task))
+        self._stages[task.stage.name].running -= 1
+        self._progress.withdrawn(_key(task), task)
+
     def tick(self) -> None:
         """Keep the display alive."""
         self._progress.tick()
@@ -206,12 +221,8 @@ def say_end(console: Console, report: RunReport, out: str, places: Sequence[str]
     `stale` are folders with older results.
     """
     new = [r for r in report.results if r.state == "done"]
-    remarks = [f"`{r.task.log.name}` {r.task.name}: {text}" for r in new if r.entry for text in r.entry.remarks]
-    for text in remarks[:MAX_LINES]:
-        console.say(f"note: {text}")
-    if len(remarks) > MAX_LINES:
-        console.say(f"note: and {len(remarks) - MAX_LINES} more; `--json` lists them")
-    warnings = [f"`{r.task.log.name}` {r.task.name}: {text}" for r in new if r.entry for text in r.entry.warnings]
+    _say_remarks(console, new)
+    warnings = _grouped([(r.task, text) for r in new if r.entry for text in r.entry.warnings])
     for text in warnings[:MAX_LINES]:
         console.warn(text)
     hidden = max(0, len(warnings) - MAX_LINES)
@@ -224,6 +235,26 @@ def say_end(console: Console, report: RunReport, out: str, places: Sequence[str]
         console.warn(f"`{text}` still holds the result of an earlier run")
     if places:
         console.say(f"results: {places[0]}" + (f" and {len(places) - 1} more" if len(places) > 1 else ""))
+
+
+def _say_remarks(console: Console, new: Sequence[TaskResult]) -> None:
+    """How the input of the first few logs was understood."""
+    with_remarks = [result for result in new if result.entry and result.entry.remarks]
+    logs = list(dict.fromkeys(result.task.log.name for result in with_remarks))
+    shown = [result for result in with_remarks if result.task.log.name in logs[:REMARKED_LOGS]]
+    for text in _grouped([(r.task, text) for r in shown if r.entry for text in r.entry.remarks])[:MAX_LINES]:
+        console.say(f"note: {text}")
+    if len(logs) > REMARKED_LOGS:
+        console.say(f"note: and those of {len(logs) - REMARKED_LOGS} more logs; `--json` lists them")
+
+
+def _grouped(said: Sequence[tuple[Task, str]]) -> list[str]:
+    """Each sentence once, with the task that said it first and how many others did."""
+    places: dict[str, list[str]] = {}
+    for task, text in said:
+        places.setdefault(text, []).append(f"`{task.log.name}` {task.name}")
+    counts = {text: f" and {len(who) - 1} more" if len(who) > 1 else "" for text, who in places.items()}
+    return [f"{who[0]}{counts[text]}: {text}" for text, who in places.items()]
 
 
 def _say_failures(console: Console, failures: Sequence[TaskResult], out: str) -> None:
@@ -254,6 +285,12 @@ class _Progress:
 
     def settled(self, key: str, result: TaskResult) -> None:
         """It is over."""
+
+    def reopened(self, result: TaskResult) -> None:
+        """What is stored of it is damaged; it is to run again."""
+
+    def withdrawn(self, key: str, task: Task) -> None:
+        """It stopped, to wait for an input that is made again."""
 
     def tick(self) -> None:
         """Some time has passed."""
@@ -298,6 +335,14 @@ class _Lines(_Progress):
             self._console.say(f"{name}: done, {rows:,} rows in {result.seconds:.1f} s")
         elif result.state == "failed":
             self._console.say(f"{name}: failed")
+
+    def reopened(self, result: TaskResult) -> None:
+        """Say so."""
+        self._console.say(f"{result.task.log.name} {result.task.name}: stored result damaged, dropped")
+
+    def withdrawn(self, key: str, task: Task) -> None:  # noqa: ARG002
+        """It is not running now."""
+        self._running.pop(key, None)
 
     def tick(self) -> None:
         """Every ten seconds, say how far everything is."""
@@ -364,6 +409,17 @@ class _Bars(_Progress):
             self._whole.update(1)
         if result.state == "failed":
             self.tick()
+
+    def reopened(self, result: TaskResult) -> None:  # noqa: ARG002
+        """One less is done."""
+        self._settled -= 1
+        if self._whole is not None:
+            self._whole.update(-1)
+
+    def withdrawn(self, key: str, task: Task) -> None:  # noqa: ARG002
+        """Take its bar away; it comes back when it starts again."""
+        if (bar := self._bars.pop(key, None)) is not None:
+            bar.close()
 
     def tick(self) -> None:
         """Redraw, so that the time goes on even where nothing else does."""

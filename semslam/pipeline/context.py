@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import resource
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from semslam.errors import SemslamError
-from semslam.pipeline.cache import SHARD, TIMING, Work, shard_name
+from semslam.pipeline.cache import SHARD, TIMING, DamagedEntryError, Work, shard_name
 from semslam.pipeline.digest import sha256_file, sha256_text
 from semslam.pipeline.files import canonical_json, remove
 from semslam.pipeline.job import InputFile, Job
 from semslam.stages.contract import FinishedShard, ShardWriter, Stage, TableSink, TableSource
-from semslam.tables.parquet import TableFiles, TableFileWriter
+from semslam.tables.parquet import TableError, TableFiles, TableFileWriter
 from semslam.tables.spec import Table
 
 MAX_WARNINGS = 100
@@ -173,7 +173,7 @@ class Context:
         """A table that the stage declared in `reads`, after its files were compared with their digests.
 
         Raises:
-            SemslamError: a file is missing or damaged.
+            DamagedEntryError: a file is missing or damaged.
             KeyError: an optional table that the log does not have.
         """
         if table not in self._job.stage.reads:
@@ -181,7 +181,11 @@ class Context:
         if table.name not in self._sources:
             files = self._job.inputs[table.name]
             check_inputs(table.name, self._job.log, files)
-            self._sources[table.name] = TableFiles(table, [Path(file.path) for file in files])
+            try:
+                self._sources[table.name] = TableFiles(table, [Path(file.path) for file in files])
+            except TableError:
+                check_inputs(table.name, self._job.log, files)  # removed meanwhile, to be made again
+                raise
         return self._sources[table.name]
 
     @contextlib.contextmanager
@@ -215,7 +219,7 @@ def check_inputs(table: str, log: str, files: Sequence[InputFile]) -> None:
     """Compare stored files with their digests.
 
     Raises:
-        SemslamError: one is missing or has another content.
+        DamagedEntryError: one is missing or has another content.
     """
     for file in files:
         try:
@@ -223,10 +227,18 @@ def check_inputs(table: str, log: str, files: Sequence[InputFile]) -> None:
         except OSError as error:
             found = error.strerror or type(error).__name__
         if found != file.sha256:
-            raise SemslamError(
+            entry = Path(file.path).parents[1]  # ENTRY/shard-00000/TABLE.parquet
+            raise DamagedEntryError(
                 f"Stored table `{table}` of `{log}` is damaged: `{file.path}`",
-                hint="`semslam verify OUT --remove` drops damaged entries; then run the same command again",
+                hint=f"drop damaged entries with `semslam verify {_output_folder(entry)} --remove`, "
+                "then run the same command again",
+                entry=entry,
             )
+
+
+def _output_folder(entry: Path) -> str:
+    """The output folder of an entry, which is OUT/cache/STAGE/KEY, as a person would type it."""
+    return shlex.quote(str(entry.parents[2]))
 
 
 def _check_tables(stage: Stage, index: int, written: Mapping[str, Any]) -> None:

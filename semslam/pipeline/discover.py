@@ -12,7 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, pairwise
 from pathlib import Path
 
 from semslam.errors import UsageError
@@ -39,10 +39,11 @@ class Problem:
 
 @dataclass(frozen=True)
 class Discovery:
-    """Logs sorted by name, and what had to be left out."""
+    """Logs sorted by name, what had to be left out, and which parts of split recordings seem to be missing."""
 
     logs: tuple[Log, ...]
     problems: tuple[Problem, ...]
+    warnings: tuple[str, ...] = ()
 
 
 def discover(names: Sequence[str], known: Mapping[str, Sequence[str]] | None = None) -> Discovery:
@@ -62,7 +63,7 @@ def discover(names: Sequence[str], known: Mapping[str, Sequence[str]] | None = N
     if not files and not problems:
         raise UsageError("No logs were named", hint="name files, folders or globs, such as `semslam run logs/`")
     groups = sorted(_grouped(files.values()))
-    return Discovery(tuple(_named(groups, known or {})), tuple(problems))
+    return Discovery(tuple(_named(groups, known or {})), tuple(problems), tuple(_gaps(files.values())))
 
 
 def _expand(name: str, problems: list[Problem]) -> Iterator[Path]:
@@ -153,20 +154,49 @@ def _sibling_hint(path: Path) -> str:
 
 def _grouped(files: Iterable[Path]) -> Iterator[tuple[Path, ...]]:
     """Files as logs: split recordings together in recording order, all others alone."""
-    splits: dict[tuple[Path, str], list[tuple[int, Path]]] = {}
-    for path in files:
-        match = _SPLIT.match(path.name)
-        if match is None:
-            yield (path,)
-        else:
-            splits.setdefault((path.parent, match["name"]), []).append((int(match["number"]), path))
-    for (parent, _), parts in splits.items():
-        parts.sort()
-        consecutive = [number for number, _ in parts] == list(range(len(parts)))
-        if len(parts) > 1 and (consecutive or (parent / "metadata.yaml").exists()):
+    paths = list(files)
+    yield from ((path,) for path in paths if not _SPLIT.match(path.name))
+    for parts in _numbered(paths):
+        if _belong_together(parts):
             yield tuple(path for _, path in parts)
         else:
             yield from ((path,) for _, path in parts)
+
+
+def _numbered(files: Iterable[Path]) -> list[list[tuple[int, Path]]]:
+    """Files called NAME_NUMBER.mcap with their numbers, rising, those of one NAME in one folder together."""
+    splits: dict[tuple[Path, str], list[tuple[int, Path]]] = {}
+    for path in files:
+        if match := _SPLIT.match(path.name):
+            splits.setdefault((path.parent, match["name"]), []).append((int(match["number"]), path))
+    return [sorted(parts) for parts in splits.values()]
+
+
+def _belong_together(parts: Sequence[tuple[int, Path]]) -> bool:
+    consecutive = [number for number, _ in parts] == list(range(len(parts)))
+    return len(parts) > 1 and (consecutive or (parts[0][1].parent / "metadata.yaml").exists())
+
+
+def _gaps(files: Iterable[Path]) -> Iterator[str]:
+    """A sentence for every gap in the numbers of what is, or would be, a split recording."""
+    for parts in sorted(_numbered(files), key=lambda parts: parts[0][1]):
+        if len(parts) < 2 or not (parts[0][0] == 0 or _belong_together(parts)):
+            continue
+        apart = "" if _belong_together(parts) else f"; they are taken as {len(parts)} logs"
+        if parts[0][0] > 0:
+            yield f"{_missing(parts[0][1], 0, parts[0][0])} missing before `{parts[0][1].name}`"
+        for (low, before), (high, after) in pairwise(parts):
+            if high > low + 1:
+                yield f"{_missing(before, low + 1, high)} missing between `{before.name}` and `{after.name}`{apart}"
+
+
+def _missing(like: Path, start: int, stop: int) -> str:
+    """Names of the parts [start, stop), with the verb, written as the name of the part `like`."""
+    match = _SPLIT.match(like.name)
+    digits = match["number"] if match else ""
+    width = len(digits) if digits.startswith("0") else 0
+    names = [f"`{match['name'] if match else ''}_{number:0{width}d}.mcap`" for number in (start, stop - 1)]
+    return f"{names[0]} is" if stop == start + 1 else f"{names[0]} to {names[1]} are"
 
 
 def _named(groups: Sequence[tuple[Path, ...]], known: Mapping[str, Sequence[str]]) -> list[Log]:

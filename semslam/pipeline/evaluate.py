@@ -1,11 +1,12 @@
-"""Evaluate: how far every estimator's track is from the truth, beside what luck and standing still score.
+"""Evaluate: how far every estimator's track is from the truth, beside dead reckoning, luck and standing still.
 
-Reads   truth, poses       data_spec.md, tables 4 and 7
+Reads   truth, motion, poses       data_spec.md, tables 4, 3 and 7
 Writes  evaluation         data_spec.md, table 11, as OUT/results/evaluation.parquet
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from semslam.errors import SemslamError
+from semslam.geometry.frames import SE2
 from semslam.metrics import Score, Track, chance, score, standstill
 from semslam.pipeline.cache import EntryIndex, table_files
 from semslam.pipeline.console import table
@@ -21,8 +23,9 @@ from semslam.pipeline.files import TEMPORARY
 from semslam.pipeline.folder import OutputFolder
 from semslam.pipeline.record import LogRecord, load_records
 from semslam.tables.parquet import TableFiles, write_table
-from semslam.tables.spec import EVALUATION, OBSERVATIONS, POSES, TRUTH, Table
+from semslam.tables.spec import EVALUATION, MOTION, OBSERVATIONS, POSES, TRUTH, Table
 
+DEAD_RECKONING = "dead_reckoning"
 CHANCE = "chance"
 STANDSTILL = "standstill"
 _SEED = 0
@@ -66,7 +69,12 @@ def evaluate_run(folder: OutputFolder) -> Evaluation:
     index = EntryIndex(folder.cache)
     lines: list[Line] = []
     notes: list[str] = []
-    for name, record in load_records(folder.logs).items():
+    records = load_records(folder.logs)
+    failed = {name: reason for name, record in records.items() if (reason := _failure(record, TRUTH.stage))}
+    for name, record in records.items():
+        if name in failed:
+            notes.append(f"{TRUTH.stage} of `{name}` failed: {failed[name]}")
+            continue
         truth = _track(folder, index, record, TRUTH, "")
         if truth is None or not len(truth.frames):
             notes.append(f"`{name}` has no ground truth")
@@ -76,7 +84,9 @@ def evaluate_run(folder: OutputFolder) -> Evaluation:
         raise SemslamError(
             f"No log of `{folder.root}` has both ground truth and poses",
             details="\n".join(notes),
-            hint="name the topic with `semslam run LOG --topic truth=/ground_truth`",
+            hint=f"`semslam status {folder.root}` shows what failed"
+            if records and len(failed) == len(records)
+            else "name the topic with `semslam run LOG --topic truth=/ground_truth`",
         )
     return Evaluation(tuple(lines), tuple(notes), _write(folder, lines))
 
@@ -84,31 +94,69 @@ def evaluate_run(folder: OutputFolder) -> Evaluation:
 def _score_log(
     folder: OutputFolder, index: EntryIndex, record: LogRecord, truth: Track, notes: list[str]
 ) -> Iterator[Line]:
+    found: set[str] = set()
     known = [task.partition("/")[2] for task in record.tasks if task.split("/")[0] == POSES.stage]
     order: list[str] = record.config[POSES.stage]["estimators"]
     for estimator in sorted(known, key=lambda name: order.index(name) if name in order else len(order)):
         track = _track(folder, index, record, POSES, estimator)
         if track is None:
-            notes.append(f"`{record.name}` has no poses of `{estimator}`")
+            reason = _failure(record, f"{POSES.stage}/{estimator}")
+            notes.append(f"`{record.name}` has no poses of `{estimator}`" + (f": {reason}" if reason else ""))
             continue
+        found.add(estimator)
         if _outdated(index, record, estimator):
             notes.append(f"poses of `{estimator}` for `{record.name}` are older than its observations; run again")
         yield Line(record.name, estimator, score(truth, track))
+    if DEAD_RECKONING not in found:
+        motion = _rows(folder, index, record, MOTION, "", ("frame", "stamp_nanos", "dx_m", "dy_m", "dheading_rad"))
+        if motion is None:
+            notes.append(f"`{record.name}` has no motion for `{DEAD_RECKONING}`")
+        else:
+            yield Line(record.name, DEAD_RECKONING, score(truth, compose(motion)))
     yield Line(record.name, CHANCE, chance(truth, _map_half_m(record), _SEED))
     yield Line(record.name, STANDSTILL, standstill(truth))
 
 
+def compose(motion: Mapping[str, Sequence[Any]]) -> Track:
+    """The track that the measured motions give, one after the other, from the columns of the motion table.
+
+    As slam/dead_reckoning.py has it: the first keyframe stands at the origin, and one whose motion is unknown has no
+    pose, while the last is held.
+    """
+    held: SE2 | None = None
+    poses: list[tuple[float, float, float]] = []
+    for step in zip(motion["dx_m"], motion["dy_m"], motion["dheading_rad"], strict=True):
+        known = held is None or None not in step
+        held = SE2(0.0, 0.0, 0.0) if held is None else held @ SE2(*step) if known else held
+        poses.append((held.x_m, held.y_m, held.heading_rad) if known else (math.nan, math.nan, math.nan))
+    columns = [[pose[axis] for pose in poses] for axis in range(3)]
+    return Track.of(motion["frame"], motion["stamp_nanos"], *columns)
+
+
+def _failure(record: LogRecord, task: str) -> str:
+    """Why a task failed in the last run; empty if it did not."""
+    found = record.tasks.get(task)
+    return found.failure.message if found and found.failure else ""
+
+
 def _track(folder: OutputFolder, index: EntryIndex, record: LogRecord, of: Table, variant: str) -> Track | None:
     """Poses of a table as a track; None if the log has none."""
+    columns = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")
+    rows = _rows(folder, index, record, of, variant, columns)
+    return None if rows is None else Track.of(*(rows[column] for column in columns))
+
+
+def _rows(
+    folder: OutputFolder, index: EntryIndex, record: LogRecord, of: Table, variant: str, columns: Sequence[str]
+) -> dict[str, list[Any]] | None:
+    """Columns of a table of a log; None if the log does not have the table."""
     task = record.tasks.get(f"{of.stage}/{variant}" if variant else of.stage)
     entry = index.find(of.stage, task.key) if task and task.key else None
     if entry is None or of.name not in entry.tables:
         return None
     files = table_files(folder.stage(of.stage) / entry.key)[of.name]
     check_inputs(of.name, record.name, files)
-    columns = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")
-    rows = TableFiles(of, [Path(file.path) for file in files]).read(columns)
-    return Track.of(*(rows[column] for column in columns))
+    return TableFiles(of, [Path(file.path) for file in files]).read(columns)
 
 
 def _outdated(index: EntryIndex, record: LogRecord, estimator: str) -> bool:

@@ -133,15 +133,19 @@ class ProcessPool:
 
     def _start(self) -> _Worker:
         import multiprocessing
+        from multiprocessing import resource_tracker
 
         spawn = multiprocessing.get_context("spawn")
         ours, theirs = spawn.Pipe()
         before = {name: os.environ.get(name) for name in ONE_THREAD}
         os.environ.update(ONE_THREAD)
+        resource_tracker.ensure_running()  # it unblocks the signal when it starts
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a worker inherits that while it imports
         try:
             process = spawn.Process(target=_work, args=(theirs,), daemon=True)
             process.start()
         finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
             _restore_environment(before)
         theirs.close()
         worker = _Worker(process, ours)

@@ -12,8 +12,10 @@ class Failure:
     """What went wrong.
 
     Attributes:
-        kind: refused (the log or a setting does not do), unexpected (a bug), memory, killed, or blocked.
+        kind: refused (the log or a setting does not do), damaged (a stored input), unexpected (a bug), memory, killed,
+            or blocked.
         traceback: where an unexpected error came from; empty for the others.
+        entry: folder of the stored entry that is damaged; empty for the other kinds.
     """
 
     kind: str
@@ -21,6 +23,7 @@ class Failure:
     hint: str = ""
     details: str = ""
     traceback: str = ""
+    entry: str = ""
 
     def as_json(self) -> dict[str, str]:
         """Plain values without the traceback, which lies in a file of its own."""

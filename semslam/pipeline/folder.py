@@ -33,6 +33,8 @@ from semslam.pipeline.files import TEMPORARY, read_json, write_json
 
 FORMAT = "semslam"
 FORMAT_VERSION = 1
+CHECK_PICTURE = ".check.png"
+"""End of the names of pictures that `ingest --check` puts into a folder before any run does."""
 _MARK = "semslam.json"
 _LOCK = ".lock"
 _LOCK_TRIES = 5
@@ -145,10 +147,15 @@ def open_folder(root: Path) -> OutputFolder:
         )
     found = read_json(mark)
     version = found.get("version") if isinstance(found, dict) and found.get("format") == FORMAT else None
-    if version != FORMAT_VERSION:
-        said = f"of format version {version}" if version is not None else f"marked by an unreadable `{_MARK}`"
+    if type(version) is not int:
         raise UsageError(
-            f"Output folder `{root}` is {said}; this semslam reads version {FORMAT_VERSION}",
+            f"Output folder `{root}` is marked by a damaged or unreadable `{_MARK}`",
+            hint=f'if semslam made the folder, write {{"format": "{FORMAT}", "version": {FORMAT_VERSION}}} into '
+            f"`{mark}`; else name another folder with `--out`",
+        )
+    if version != FORMAT_VERSION:
+        raise UsageError(
+            f"Output folder `{root}` is of format version {version}; this semslam reads version {FORMAT_VERSION}",
             hint="name another folder with `--out`, or use the version of semslam that wrote it",
         )
     return OutputFolder(root)
@@ -158,7 +165,7 @@ def _refuse_foreign(root: Path) -> None:
     """An unknown folder with content is not ours to write into."""
     if not root.exists():
         return
-    content = sorted(name for name in os.listdir(root) if not name.startswith(TEMPORARY))
+    content = sorted(n for n in os.listdir(root) if not n.startswith(TEMPORARY) and not n.endswith(CHECK_PICTURE))
     if content:
         shown = ", ".join(f"`{name}`" for name in content[:3]) + (", ..." if len(content) > 3 else "")
         raise UsageError(

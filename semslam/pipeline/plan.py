@@ -2,7 +2,8 @@
 
 A task is a stage of a log, in a variant where the stage or one before it has variants. Its key is made of all that its
 result depends on: stage, version, variant, own configuration with the content of files in place of their paths, the
-digests of the *tables* it reads, the digests of the log's files where it reads those, and the version of the tables.
+versions of the libraries it computes with, the execution provider of its networks, the digests of the *tables* it
+reads, the digests of the log's files where it reads those, and the version of the tables.
 Since keys chain by digests of results, a task can be decided only when those before it are finished, and a stage
 that runs again with the same result stops the wave.
 """
@@ -12,10 +13,12 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from semslam.errors import SemslamError, UsageError
+from semslam.models.onnxfile import read_onnx
 from semslam.pipeline.cache import Entry, EntryIndex, finished_shards, key_of
 from semslam.pipeline.config import Config, file_settings, plain
 from semslam.pipeline.digest import DigestCache, sha256_text
@@ -26,7 +29,9 @@ from semslam.stages.contract import Stage
 from semslam.tables.spec import SPEC_VERSION
 
 ABSENT = "absent"
-"""Stands in a key for the digest of an optional table that the log does not have."""
+"""Stands in a key for the digest of an optional table that the log does not have, or for a library's version."""
+PROVIDER = "SEMSLAM_PROVIDER"
+"""Environment variable that names the execution provider of networks; `auto` in a key where it is not set."""
 
 
 @dataclass(frozen=True)
@@ -149,18 +154,30 @@ class Planner:
             SemslamError: a file of the log cannot be read.
         """
         stage = task.stage
+        value = {**self.standing(task), "inputs": self._input_digests(task, before)}
+        if stage.name == self._published:
+            value["log"] = task.log.name
+        if stage.from_log:
+            value["sources"] = [self._source_digest(path) for path in task.log.sources]
+        return value
+
+    def standing(self, task: Task) -> dict[str, Any]:
+        """The components that are the same for all logs.
+
+        Raises:
+            UsageError: a file named in the configuration cannot be read.
+        """
+        stage = task.stage
         value: dict[str, Any] = {
             "stage": stage.name,
             "version": stage.version,
             "variant": task.variant,
             "config": self._settings_of(task),
-            "inputs": self._input_digests(task, before),
             "spec": SPEC_VERSION,
+            "libraries": {name: library_version(name) for name in stage.libraries},
         }
-        if stage.name == self._published:
-            value["log"] = task.log.name
-        if stage.from_log:
-            value["sources"] = [self._source_digest(path) for path in task.log.sources]
+        if any(path.lower().endswith(".onnx") for _, path in file_settings(self.task_config(task), stage.name)):
+            value["provider"] = os.environ.get(PROVIDER) or "auto"
         return value
 
     def _input_digests(self, task: Task, before: Mapping[tuple[str, str], Entry]) -> dict[str, str]:
@@ -182,7 +199,7 @@ class Planner:
     def _reason(self, stage: str, key: str, components: Mapping[str, Any], record: TaskRecord) -> str:
         shards = finished_shards(self._cache, stage, key)
         if record.failure is not None and record.failed_key == key:
-            return f"failed before: {record.failure.message}"
+            return f"try again (failed before: {record.failure.message})"
         if shards:
             return f"resume ({shards} {'shard' if shards == 1 else 'shards'})"
         if not record.key:
@@ -230,12 +247,35 @@ class Planner:
             ) from None
 
 
-def external_data(path: Path) -> list[Path]:
-    """Files in which an ONNX model keeps its weights, beside the model and named after it."""
-    if path.suffix != ".onnx" or not path.parent.is_dir():
-        return []
-    names = sorted(n for n in os.listdir(path.parent) if n.startswith((f"{path.name}.data", f"{path.name}_data")))
-    return [path.parent / name for name in names]
+def external_data(path: Path) -> tuple[Path, ...]:
+    """Files in which an ONNX model says that it keeps its weights; none for what is no readable ONNX model.
+
+    Why a model cannot be read is for those to say who open it.
+    """
+    try:
+        found = os.stat(path)
+    except OSError:
+        return ()
+    return _external_data(path, found.st_size, found.st_mtime_ns)
+
+
+@cache
+def _external_data(path: Path, size: int, mtime_nanos: int) -> tuple[Path, ...]:  # noqa: ARG001
+    try:
+        return read_onnx(path).external_files
+    except (SemslamError, OSError):
+        return ()
+
+
+@cache
+def library_version(name: str) -> str:
+    """Version of an installed distribution as `major.minor`; its later parts are taken not to change results."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return ".".join(version(name).split(".")[:2])
+    except PackageNotFoundError:
+        return ABSENT
 
 
 def changes(stage: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
@@ -253,7 +293,15 @@ def changes(stage: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[
         found.append(f"stage version {old.get('version')} -> {new['version']}")
     if old.get("spec") != new["spec"]:
         found.append(f"table specification {old.get('spec')} -> {new['spec']}")
+    found += _library_changes(old.get("libraries", {}), new.get("libraries", {}))
+    if old.get("provider") != new.get("provider"):
+        found.append(f"provider {_shown(old.get('provider'))} -> {_shown(new.get('provider'))}")
     return found or ["stored under another key"]
+
+
+def _library_changes(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:
+    names = sorted(name for name in {*old, *new} if old.get(name) != new.get(name))
+    return [f"{name} {_shown(old.get(name))} -> {_shown(new.get(name))}" for name in names]
 
 
 def _config_changes(prefix: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:

@@ -16,11 +16,12 @@ REPORT_VERSION = 1
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """A finished run; `problems` are files that could not even be opened."""
+    """A finished run; `problems` are files that could not even be opened, `warnings` name parts that seem to miss."""
 
     folder: OutputFolder
     report: RunReport
     problems: tuple[Problem, ...]
+    warnings: tuple[str, ...] = ()
 
     @property
     def exit_code(self) -> int:
@@ -43,6 +44,7 @@ class RunOutcome:
             "seconds": round(self.report.seconds, 3),
             "logs": list(logs.values()),
             "unreadable": [{"path": str(problem.path), "reason": problem.reason} for problem in self.problems],
+            "warnings": list(self.warnings),
             "exit_code": self.exit_code,
         }
 

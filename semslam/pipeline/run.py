@@ -53,7 +53,7 @@ def run(request: RunRequest, stages: Sequence[Stage], console: Console) -> RunOu
     say_end(console, report, str(folder.root), *_places(folder, report, stages[-1].name))
     for problem in found.problems:
         console.error(SemslamError(f"`{problem.path}` was left out: {problem.reason}"))
-    return RunOutcome(folder, report, found.problems)
+    return RunOutcome(folder, report, found.problems, found.warnings)
 
 
 def run_logs(
@@ -92,7 +92,10 @@ def _say_start(console: Console, request: RunRequest, found: Discovery) -> None:
     console.say(f"{console.colour(f'semslam {request.command}', 'bold')}   {count} -> {request.out}")
     for log in found.logs:
         if len(log.sources) > 1:
-            console.say(f"`{log.name}` is a recording in {len(log.sources)} files")
+            ends = f"`{log.sources[0].name}` to `{log.sources[-1].name}`"
+            console.say(f"`{log.name}` is a recording in {len(log.sources)} files, {ends}")
+    for warning in found.warnings:
+        console.warn(warning)
 
 
 def _places(folder: OutputFolder, report: RunReport, published: str) -> tuple[list[str], list[str]]:

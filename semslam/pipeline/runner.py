@@ -3,6 +3,9 @@
 The loop is driven by one thread. Tasks are decided as soon as those before them are settled; tasks of different logs
 that turn out to be the same work (equal keys) run once. One failed task blocks those that need it and nothing else; it
 is tried again by every run, because a cause outside the key (memory, a missing library) may be gone.
+
+A task that finds a stored input damaged is no failure yet: the damaged entry is dropped, made again, and the task tried
+once more.
 """
 
 from __future__ import annotations
@@ -13,19 +16,21 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
+from pathlib import Path
 from typing import Any, Protocol
 
 from semslam.errors import SemslamError, UsageError
-from semslam.pipeline.cache import Entry, EntryIndex, table_files
+from semslam.pipeline.cache import DamagedEntryError, Entry, EntryIndex, table_files
 from semslam.pipeline.config import Config
 from semslam.pipeline.digest import DigestCache
 from semslam.pipeline.discover import Log
 from semslam.pipeline.executors import Executor
 from semslam.pipeline.failure import Failure
-from semslam.pipeline.files import out_of_space, read_json, write_json
+from semslam.pipeline.files import out_of_space, read_json, remove, write_json
 from semslam.pipeline.folder import OutputFolder
 from semslam.pipeline.job import InputFile, Job, Outcome
 from semslam.pipeline.plan import Decision, Planner, Task, tasks_of
+from semslam.pipeline.preflight import check_new
 from semslam.pipeline.record import RecordBook
 from semslam.pipeline.results import Results
 from semslam.stages.contract import Stage
@@ -89,6 +94,12 @@ class Listener(Protocol):
     def settled(self, result: TaskResult) -> None:
         """The task is cached, done, failed or blocked."""
 
+    def reopened(self, result: TaskResult) -> None:
+        """A task that was settled so has to run again, because what is stored of it is damaged."""
+
+    def withdrawn(self, task: Task) -> None:
+        """A task that was started ended without a result and waits for a damaged input to be made again."""
+
     def tick(self) -> None:
         """Some time has passed."""
 
@@ -111,6 +122,7 @@ class _Making:
     state: _LogState
     task: Task
     decision: Decision
+    inputs: tuple[Entry, ...]
     followers: list[tuple[_LogState, Task, Decision]] = field(default_factory=list)
 
 
@@ -157,12 +169,14 @@ class Runner:
         self._running: dict[int, str] = {}
         self._numbers = count()
         self._settled: dict[tuple[int, str], TaskResult] = {}
+        self._dropped: set[Path] = set()
+        self._retried: set[tuple[int, str, Path]] = set()
 
     def run(self) -> RunReport:
         """Do all there is to do.
 
         Raises:
-            UsageError: a file named in the configuration cannot be read.
+            UsageError: a file named in the configuration cannot be read, or a stage would refuse its configuration.
             SemslamError: no space is left.
             KeyboardInterrupt: as it came; what was finished stays.
         """
@@ -188,10 +202,12 @@ class Runner:
 
     def _prepare(self) -> None:
         """Know the configuration's and the logs' files before anything depends on them."""
+        tasks = [task for state in self._states[:1] for _, task in state.undecided]
+        self._planner.check_settings(tasks)
+        check_new(self._planner, self._config, tasks, self._book.records.values())
         resolved = self._config.as_json()
         if read_json(self._folder.config) != resolved:
             write_json(self._folder.config, resolved)
-        self._planner.check_settings(task for state in self._states[:1] for _, task in state.undecided)
         missing = self._digests.unknown(path for state in self._states for path in state.log.sources)
         if missing:
             seen = self._listener.hashing(len(missing), sum(size for _, size in missing))
@@ -239,7 +255,8 @@ class Runner:
         if place in self._making:
             self._making[place].followers.append((state, task, decision))
             return
-        self._making[place] = _Making(state, task, decision)
+        inputs = tuple(state.entries[need] for need in self._planner.needs(task))
+        self._making[place] = _Making(state, task, decision, inputs)
         heapq.heappush(self._ready, (state.number, number, place))
 
     def _hand_out(self) -> None:
@@ -249,6 +266,10 @@ class Runner:
             number = next(self._numbers)
             try:
                 job = self._job(number, making)
+            except DamagedEntryError as error:
+                if not self._heal(place, error.entry):
+                    self._end(place, Failure("damaged", error.message, error.hint, error.details), None)
+                continue
             except SemslamError as error:
                 self._end(place, Failure("refused", error.message, error.hint, error.details), None)
                 continue
@@ -277,8 +298,7 @@ class Runner:
     def _inputs(self, making: _Making) -> dict[str, tuple[InputFile, ...]]:
         """Stored files of all tables the task reads."""
         stored: dict[str, tuple[InputFile, ...]] = {}
-        for need in self._planner.needs(making.task):
-            entry = making.state.entries[need]
+        for entry in making.inputs:
             stored |= table_files(self._folder.stage(entry.stage) / entry.key)
         return {table.name: stored[table.name] for table in making.task.stage.reads if table.name in stored}
 
@@ -289,7 +309,46 @@ class Runner:
         """A job ended."""
         if outcome.out_of_space:
             raise self._no_space()
-        self._end(self._running.pop(outcome.number), outcome.failure, outcome)
+        place = self._running.pop(outcome.number)
+        failure = outcome.failure
+        if failure is not None and failure.kind == "damaged":
+            task = self._making[place].task
+            if self._heal(place, Path(failure.entry)):
+                self._listener.withdrawn(task)
+                return
+        self._end(place, failure, outcome)
+
+    def _heal(self, place: str, damaged: Path) -> bool:
+        """Drop a damaged entry and take up again all who made it or wait for it; False if that was tried in vain."""
+        making = self._making[place]
+        attempt = (making.state.number, making.task.name, damaged)
+        if attempt in self._retried:
+            return False
+        self._retried.add(attempt)
+        if damaged not in self._dropped:
+            self._dropped.add(damaged)
+            remove(damaged)
+        del self._making[place]
+        for state, task, _ in [(making.state, making.task, making.decision), *making.followers]:
+            state.undecided.append((self._order(state, task), task))
+        for state in self._states:
+            self._reopen(state, damaged)
+            self._advance(state)
+        return True
+
+    def _reopen(self, state: _LogState, damaged: Path) -> None:
+        """Take back what a log has of an entry that was dropped, unless it was made again meanwhile."""
+        for place, entry in list(state.entries.items()):
+            if (entry.stage, entry.key) == (damaged.parent.name, damaged.name) and not damaged.exists():
+                task = next(task for task in tasks_of(self._stages, state.log, self._config) if _place(task) == place)
+                del state.entries[place]
+                state.undecided.append((self._order(state, task), task))
+                self._listener.reopened(self._settled.pop((state.number, task.name)))
+        state.undecided.sort(key=lambda numbered: numbered[0])
+
+    def _order(self, state: _LogState, task: Task) -> int:
+        """Place of a task among those of its log."""
+        return [one.name for one in tasks_of(self._stages, state.log, self._config)].index(task.name)
 
     def _end(self, place: str, failure: Failure | None, outcome: Outcome | None) -> None:
         """Settle the task that made a key and all that waited for the same key."""
@@ -315,7 +374,7 @@ class Runner:
     def _settle(self, state: _LogState, result: TaskResult) -> None:
         """Note what became of a task, in memory and in the log's record."""
         task = result.task
-        place = (task.stage.name, task.variant)
+        place = _place(task)
         if result.entry is not None:
             state.entries[place] = result.entry
             if task.stage.name == self._published:
@@ -372,6 +431,10 @@ class Runner:
             hint="free some space, or remove old results with `semslam clean`; then run the same command again: "
             "finished parts are kept",
         )
+
+
+def _place(task: Task) -> tuple[str, str]:
+    return (task.stage.name, task.variant)
 
 
 def _ended(task: Task, decision: Decision, entry: Entry | None, failure: Failure | None, state: str) -> TaskResult:

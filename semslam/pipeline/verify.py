@@ -26,6 +26,7 @@ from semslam.pipeline.cache import (
     load_shard,
     shard_digest,
     shard_name,
+    stored_files,
 )
 from semslam.pipeline.config import load_config
 from semslam.pipeline.console import Console, byte_bar
@@ -150,8 +151,7 @@ def _check_entry(folder: Path, seen: Callable[[int], None]) -> Iterator[Finding]
 
 def _check_files(folder: Path, manifest: dict[str, Any], seen: Callable[[int], None]) -> Iterator[Finding]:
     """Every stored file against its digest, and none besides."""
-    stored = {file["file"]: file for table in manifest["tables"].values() for file in table["shards"]}
-    stored |= {file["file"]: file for file in manifest["files"]}
+    stored = {file["file"]: file for file in stored_files(manifest)}
     for name, file in stored.items():
         try:
             found = sha256_file(folder / name, seen)
@@ -197,7 +197,7 @@ def _check_records(folder: OutputFolder) -> Iterator[Finding]:
             stage, _, variant = task.partition("/")
             entry = index.find(stage, one.key) if one.key else None
             if one.key and entry is None:
-                yield Finding(f"{name} {task}", "its result is gone; the next run makes it anew")
+                yield Finding(f"{name} {task}", "its result is gone or damaged; the next run makes it anew")
             elif entry is not None and (folder.results / name / variant).is_dir():
                 yield from _check_results(folder, name, variant, entry)
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import semslam
 from semslam.errors import SemslamError
-from semslam.pipeline.cache import Work, build_manifest
+from semslam.pipeline.cache import DamagedEntryError, Work, build_manifest
 from semslam.pipeline.context import Context, max_rss_bytes
 from semslam.pipeline.digest import FileStamp
 from semslam.pipeline.failure import Failure
@@ -65,6 +65,8 @@ def _check_unchanged(job: Job) -> None:
 
 def describe(error: Exception) -> Failure:
     """What to tell and to keep of an exception."""
+    if isinstance(error, DamagedEntryError):
+        return Failure("damaged", error.message, error.hint, error.details, entry=str(error.entry))
     if isinstance(error, SemslamError):
         return Failure("refused", error.message, error.hint, error.details)
     if isinstance(error, MemoryError):
