@@ -117,6 +117,16 @@ def test_ids_name_the_object_that_stands_there(seed: int) -> None:
     assert len(seen) >= 5
 
 
+def test_a_silhouette_is_what_an_object_covers_alone() -> None:
+    """Of two boxes in a row, the far one keeps its whole silhouette though most of it is hidden."""
+    room = make_room(0)
+    near, far = (Solid((x, 0.0, 0.5), (0.1, 0.3, 0.3), GREY, object_id=n) for n, x in ((1, 1.0), (2, 2.0)))
+    alone = Renderer(replace(room, solids=(far,))).view(CAMERA, look())
+    both = Renderer(replace(room, solids=(near, far)))
+    assert both.silhouettes(CAMERA, look())[2] == (alone.object_ids == 2).sum() > 0
+    assert (both.view(CAMERA, look()).object_ids == 2).sum() == 0
+
+
 def test_boxes_are_tight_around_the_visible_pixels() -> None:
     """One pixel less on any side would cut the object; small glimpses are left out."""
     room = make_room(5)

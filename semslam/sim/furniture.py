@@ -92,14 +92,19 @@ def chair(rng: np.random.Generator) -> Piece:
 
 
 def table(rng: np.random.Generator) -> Piece:
-    """A top on four legs, with something on it."""
+    """A top with an apron on two solid ends, and a bowl on it."""
     depth, width, height = float(rng.uniform(0.75, 0.85)), float(rng.uniform(1.15, 1.35)), 0.74
     material = wood(rng)
+    apron = Material("wood", shade(material.colour, 0.85), material.second)
     solids = [_box((0, 0, height - 0.025), (depth, width, 0.05), material)]
-    solids += _legs(depth - 0.06, width - 0.06, height - 0.05, 0.07, material)
+    solids += [
+        _box((0, y, (height - 0.05) / 2), (depth - 0.1, 0.06, height - 0.05), material) for y in _ends(width, 0.2)
+    ]
+    solids += [_box((x, 0, height - 0.13), (0.03, width - 0.2, 0.16), apron) for x in _ends(depth, 0.12)]
     bowl = Material("plain", pick(rng, _POTS), (0.2, 0.2, 0.2))
-    solids += [_box((0, float(rng.uniform(-0.3, 0.3)), height + 0.05), (0.2, 0.2, 0.1), bowl)]
-    return Piece("table", depth, width, tuple(solids))
+    return Piece(
+        "table", depth, width, (*solids, _box((0, float(rng.uniform(-0.3, 0.3)), height + 0.05), (0.2, 0.2, 0.1), bowl))
+    )
 
 
 def sofa(rng: np.random.Generator) -> Piece:

@@ -75,6 +75,19 @@ class Renderer:
         """(H, W) exact depth along the optical axis, metres; much faster than a whole view."""
         return self._cast(camera, room_from_camera)[0]
 
+    def silhouettes(self, camera: Camera, room_from_camera: NDArray[np.float64]) -> NDArray[np.int64]:
+        """(objects + 1,) pixels that each object would cover if nothing stood before it, by object id; entry 0 is 0."""
+        rotation, origin = room_from_camera[:3, :3], room_from_camera[:3, 3]
+        x, y = ray_xy(camera)
+        in_camera = (self._corners - origin) @ rotation
+        covered = np.zeros((len(self._class_ids), camera.height, camera.width), bool)
+        for index, solid in enumerate(self._solids):
+            window = screen_window(in_camera[index], camera)
+            if window is not None and solid.object_id:
+                hit = cast_solid(solid, rotation, origin, x[window[1]], y[window[0]])
+                covered[solid.object_id][window] |= np.isfinite(hit)
+        return np.asarray(covered.sum((1, 2)), np.int64)
+
     def _cast(
         self, camera: Camera, room_from_camera: NDArray[np.float64]
     ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
