@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -115,3 +116,14 @@ def test_depth_noise_grows_with_range_and_ends_at_the_reach() -> None:
     assert far.std() / near.std() == pytest.approx(16, rel=0.1)
     assert not measure_depth(np.full((4, 4), 8.1, np.float32), rng()).any()
     assert not measure_depth(np.full((4, 4), 2.0, np.float32), rng(), max_depth_m=1.9).any()
+
+
+def test_depth_that_is_no_number_is_missing() -> None:
+    """Rays that hit nothing, and those that tell nothing, give 0 like what lies out of reach."""
+    depth = np.array([[1.0, np.nan, np.inf, 9.0]], np.float32)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "invalid value encountered in cast")  # what it gives depends on the processor
+        warnings.filterwarnings("ignore", "invalid value encountered in add")
+        found = measure_depth(depth, rng())
+    assert abs(int(found[0, 0]) - 1000) < 20
+    assert found[0, 1:].tolist() == [0, 0, 0]

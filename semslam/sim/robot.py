@@ -225,7 +225,8 @@ def measure_depth(
     """Depth as a stereo camera gives it: millimetres, noise growing with the square of range, 0 beyond its reach."""
     spread = 0.0015 * depth_m * depth_m
     noisy = depth_m + spread * rng.standard_normal(depth_m.shape, np.float32)
-    return np.where(depth_m > max_depth_m, 0, np.round(noisy * 1000)).astype(np.uint16)
+    seen = depth_m <= max_depth_m  # false for NaN too, which has no whole number
+    return np.where(seen, np.round(noisy * 1000), 0).astype(np.uint16)
 
 
 def _into_body(vectors: Array, heading_rad: Array) -> Array:
