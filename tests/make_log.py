@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from semslam.sim.recording import Plan, ToyTruth, record
+from semslam.sim.toy.recording import Plan, ToyTruth, record
 
 __all__ = ["ToyTruth", "make_log"]
 

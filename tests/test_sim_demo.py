@@ -16,9 +16,9 @@ from semslam.errors import SemslamError
 from semslam.logs.reader import LogReader
 from semslam.logs.roles import choose_roles, peek
 from semslam.sim import demo
-from semslam.sim.render import Renderer, VisibleBox, pinhole, visible_boxes
-from semslam.sim.robot import base_pose, mount, optical, plan_path
-from semslam.sim.toyroom import CLASSES, make_room
+from semslam.sim.toy.render import Renderer, VisibleBox, pinhole, visible_boxes
+from semslam.sim.toy.robot import base_pose, mount, optical, plan_path
+from semslam.sim.toy.toyroom import CLASSES, make_room
 
 UNSEEN_ROOM = 30_001
 MIN_PIXELS, MIN_SHARE, MIN_SCORE, MIN_OVERLAP = 120, 0.25, 0.3, 0.5

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semslam.sim.robot import (
+from semslam.sim.toy.robot import (
     GRAVITY_M_S2,
     DrivePath,
     ImuNoise,
@@ -21,7 +21,7 @@ from semslam.sim.robot import (
     optical,
     plan_path,
 )
-from semslam.sim.toyroom import make_room
+from semslam.sim.toy.toyroom import make_room
 
 TIMES = np.arange(0, 20, 0.01)
 SILENT = ImuNoise(0, 0, 0, 0)

@@ -28,9 +28,9 @@ import torch.nn.functional as F  # noqa: N812 - the name everybody uses
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from semslam.sim.render import Renderer, View, pinhole, visible_boxes
-from semslam.sim.robot import base_pose, mount, optical, plan_path
-from semslam.sim.toyroom import CLASSES, make_room
+from semslam.sim.toy.render import Renderer, View, pinhole, visible_boxes
+from semslam.sim.toy.robot import base_pose, mount, optical, plan_path
+from semslam.sim.toy.toyroom import CLASSES, make_room
 
 WIDTH, HEIGHT = 320, 240
 STRIDES = (8, 16)

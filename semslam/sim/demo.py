@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from semslam.errors import SemslamError
-from semslam.sim.recording import Plan, record
+from semslam.sim.toy.recording import Plan, record
 
 DEMO_SEED = 128
 """A room whose every keyframe shows three objects or more, and a drive with less wheel drift than most: the map of the

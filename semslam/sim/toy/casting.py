@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semslam.geometry.camera import Camera
-from semslam.sim.furniture import Solid
-from semslam.sim.texture import noise
-from semslam.sim.toyroom import turn
+from semslam.sim.toy.furniture import Solid
+from semslam.sim.toy.texture import noise
+from semslam.sim.toy.toyroom import turn
 
 FLOOR, WALL, CEILING = 0, 1, 2
 """Surfaces of the room itself."""
