@@ -202,7 +202,7 @@ def stripes(look: Look, rng: np.random.Generator) -> Array:
     )
     order = [0, 1, 0, 2 % len(look.colours) if len(look.colours) > 1 else 1]
     band = np.minimum((along * 8).astype(int), 7)
-    return colours[np.array(order)[band % 4]] * (1 + 0.05 * noise(rng, 0.01))[..., None]
+    return np.asarray(colours[np.array(order)[band % 4]] * (1 + 0.05 * noise(rng, 0.01))[..., None])
 
 
 def plaid(look: Look, rng: np.random.Generator) -> Array:
