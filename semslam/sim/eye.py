@@ -11,7 +11,7 @@ import math
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from semslam.sim.home import (
     LIGHTS,
     SKY_KINDS,
     Array,
+    Colour,
     Fixture,
     Home,
     Light,
@@ -165,6 +166,7 @@ def build_model(home: Home, camera: Camera) -> tuple[mujoco.MjModel, list[tuple[
     if home.walker is not None:
         body = spec.worldbody.add_body(name=_WALKER, mocap=True)
         builder.add(body, home.walker.piece.parts, home.walker.instance, OBSTACLE)
+    builder.finish()
     model = spec.compile()
     labels = dict(builder.geoms)
     return model, [labels[model.geom(index).name] for index in range(model.ngeom)]
@@ -191,53 +193,100 @@ def studio(pieces: Sequence[Piece], *, wall_m: float = 1.5) -> Home:
     return Home(0, "studio", 0, (room,), (outline,), 2.6, tuple(objects), (floor, wall), lights, (3.0, y / 2))
 
 
+@dataclass(frozen=True)
+class _Paint:
+    """Surfaces of one colour that differ in nothing else; their colours share one texture, a swatch each."""
+
+    shine: float
+    glow: float
+    sheet: int
+    """Number of the texture among those of the same shine and glow: each has room for 256 colours."""
+
+
+_EDGE = 16
+"""Swatches along one edge of a texture; few and large meshes are drawn faster than many small ones."""
+
+
 class _Builder:
     """Adds meshes to a model and remembers what they are."""
 
     def __init__(self, spec: mujoco.MjSpec) -> None:
         self._spec = spec
-        self._looks: dict[Look, str] = {}
+        self._materials: dict[Look | _Paint, str] = {}
+        self._swatches: dict[tuple[float, float], list[Colour]] = {}
         self.geoms: list[tuple[str, tuple[int, int]]] = []
 
     def add(self, body: mujoco.MjsBody, parts: Sequence[Part], instance: int, label: int) -> None:
-        """Add the parts to a body, one geom a look."""
-        by_look: dict[Look, list[Mesh]] = {}
+        """Add the parts to a body, one geom a look; all looks of one colour count as one."""
+        groups: dict[Look | _Paint, list[Mesh]] = {}
         for part in parts:
-            by_look.setdefault(part.look, []).append(part.mesh)
-        for look, meshes in by_look.items():
-            self._add_geom(body, merge(meshes), look, (instance, label))
+            if part.look.pattern == "plain":
+                paint, mesh = self._painted(part)
+                groups.setdefault(paint, []).append(mesh)
+            else:
+                scaled = replace(part.mesh, uv=(part.mesh.uv / part.look.tile_m).astype(np.float32))
+                groups.setdefault(part.look, []).append(scaled)
+        for look, meshes in groups.items():
+            self._add_geom(body, merge(meshes), self._material(look), (instance, label))
 
-    def _add_geom(self, body: mujoco.MjsBody, shape: Mesh, look: Look, meaning: tuple[int, int]) -> None:
+    def finish(self) -> None:
+        """Draw the textures of the swatches, now that all colours are known."""
+        for look, name in self._materials.items():
+            if isinstance(look, _Paint):
+                colours = self._swatches[look.shine, look.glow][look.sheet * _EDGE**2 :][: _EDGE**2]
+                self._spec.texture(name).data = _swatch_sheet(colours).tobytes()
+
+    def _painted(self, part: Part) -> tuple[_Paint, Mesh]:
+        """The paint of a one-coloured part, and its mesh with every vertex on its swatch."""
+        shine, glow = round(part.look.shine, 1), round(part.look.glow, 1)
+        colours = self._swatches.setdefault((shine, glow), [])
+        if part.look.colours[0] not in colours:
+            colours.append(part.look.colours[0])
+        sheet, place = divmod(colours.index(part.look.colours[0]), _EDGE**2)
+        row, column = divmod(place, _EDGE)
+        uv = np.broadcast_to(np.array([column + 0.5, row + 0.5], np.float32) / _EDGE, part.mesh.uv.shape)
+        return _Paint(shine, glow, sheet), replace(part.mesh, uv=uv)
+
+    def _add_geom(self, body: mujoco.MjsBody, shape: Mesh, material: str, meaning: tuple[int, int]) -> None:
         name = f"g{len(self.geoms)}"
         mesh = self._spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
         corners = shape.faces.astype(np.int32).ravel()
         mesh.uservert = shape.vertices.astype(np.float64).ravel()
         mesh.usernormal = shape.normals.astype(np.float64).ravel()
-        mesh.usertexcoord = (shape.uv / np.float32(look.tile_m)).astype(np.float64).ravel()
+        mesh.usertexcoord = shape.uv.astype(np.float64).ravel()
         mesh.userface = mesh.userfacenormal = mesh.userfacetexcoord = corners
         body.add_geom(
             name=name,
             type=mujoco.mjtGeom.mjGEOM_MESH,
             meshname=name,
-            material=self._material(look),
+            material=material,
             contype=0,
             conaffinity=0,
         )
         self.geoms.append((name, meaning))
 
-    def _material(self, look: Look) -> str:
-        if look not in self._looks:
-            name = f"m{len(self._looks)}"
+    def _material(self, look: Look | _Paint) -> str:
+        if look not in self._materials:
+            name = f"m{len(self._materials)}"
             texture = self._spec.add_texture(
                 name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=SIZE, height=SIZE, nchannel=3
             )
-            texture.data = tile(look).tobytes()
+            if isinstance(look, Look):
+                texture.data = tile(look).tobytes()
             material = self._spec.add_material(
                 name=name, specular=look.shine, shininess=0.5, emission=look.glow, texrepeat=[1, 1]
             )
             material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-            self._looks[look] = name
-        return self._looks[look]
+            self._materials[look] = name
+        return self._materials[look]
+
+
+def _swatch_sheet(colours: Sequence[Colour]) -> NDArray[np.uint8]:
+    """(SIZE, SIZE, 3) squares of one colour each, row by row."""
+    cells = np.zeros((_EDGE * _EDGE, 3))
+    cells[: len(colours)] = colours
+    grid = np.round(np.clip(cells, 0, 1) * 255).astype(np.uint8).reshape(_EDGE, _EDGE, 3)
+    return grid.repeat(SIZE // _EDGE, 0).repeat(SIZE // _EDGE, 1)
 
 
 def _settings(spec: mujoco.MjSpec) -> None:

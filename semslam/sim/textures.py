@@ -6,6 +6,7 @@ the surface each way: columns run along the first texture axis, rows along the s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import cv2
@@ -39,12 +40,27 @@ def noise(rng: np.random.Generator, scale: float, *, stretch: float = 1.0) -> Ar
         scale: size of its blobs as a share of the tile.
         stretch: blobs are longer along rows of pixels (the first texture axis) by this factor.
     """
-    rows, columns = np.meshgrid(np.fft.fftfreq(SIZE), np.fft.fftfreq(SIZE), indexing="ij")
-    width = scale * SIZE
-    window = np.exp(-2 * (width * rows) ** 2 - 2 * (width * stretch * columns) ** 2)
-    field = np.fft.ifft2(np.fft.fft2(rng.standard_normal((SIZE, SIZE))) * window).real
+    knots = rng.standard_normal((_knots(scale), _knots(scale * stretch)), np.float32)
+    around = np.pad(knots, _RIM, mode="wrap")
+    grown = cv2.resize(
+        around,
+        (SIZE * around.shape[1] // knots.shape[1], SIZE * around.shape[0] // knots.shape[0]),
+        interpolation=cv2.INTER_CUBIC,
+    )
+    top, left = (_RIM * SIZE // count for count in knots.shape)
+    field = grown[top : top + SIZE, left : left + SIZE].astype(np.float64)
     field -= field.mean()
     return np.asarray(field / (2.5 * max(float(field.std()), 1e-9)))
+
+
+_RIM = 2
+"""Knots repeated at each edge before smoothing, so that the tile's edges meet."""
+
+
+def _knots(scale: float) -> int:
+    """Knots along one edge of the tile: a power of two, so that they fall on whole pixels."""
+    wanted = min(max(0.6 / scale, 1.0), float(SIZE))
+    return 1 << round(math.log2(wanted))
 
 
 def _cloud(rng: np.random.Generator, scale: float = 0.2) -> Array:
@@ -264,7 +280,7 @@ def lattice(look: Look, rng: np.random.Generator) -> Array:
 
 def leather(look: Look, rng: np.random.Generator) -> Array:
     """Smooth hide with fine creases."""
-    creases = np.abs(noise(rng, 0.03)) < 0.05
+    creases = np.abs(noise(rng, 0.014)) < 0.05
     picture = _flat(look.colours[0]) * (1 + 0.07 * _cloud(rng, 0.2))[..., None]
     return np.asarray(np.where(creases[..., None], picture * 0.88, picture))
 
@@ -352,7 +368,7 @@ def outdoors(look: Look, rng: np.random.Generator) -> Array:
     sky = _mix((0.86, 0.92, 0.97), (0.52, 0.72, 0.95), (up - 0.35) * 1.5)
     clouds = np.clip(_cloud(rng, 0.18) * 1.6, 0, 1)[..., None]
     picture = sky * (1 - clouds) + clouds
-    crown = 0.33 + 0.10 * noise(rng, 0.06)[0]
+    crown = 0.33 + 0.10 * noise(rng, 0.08)[0] + 0.03 * noise(rng, 0.015)[0]
     trees = up < crown[None, :]
     picture[trees] = (np.array([0.24, 0.42, 0.20]) * (1 + 0.5 * noise(rng, 0.02))[..., None])[trees]
     lawn = up < 0.16
