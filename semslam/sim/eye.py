@@ -6,14 +6,9 @@ and pose give the same bytes with or without a graphics card.
 
 from __future__ import annotations
 
-import contextlib
 import math
-import os
-import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -21,6 +16,7 @@ from numpy.typing import NDArray
 
 from semslam.geometry.camera import Camera
 from semslam.labels import FIRST_OBJECT, FREE_FLOOR, OBSTACLE, UNOBSERVED
+from semslam.sim.engine import start_engine
 from semslam.sim.home import (
     FLOOR_KINDS,
     LIGHTS,
@@ -85,30 +81,31 @@ class Eye:
         self._instances = np.array([0, *(instance for instance, _ in geoms)], np.uint16)
         self._classes = np.array([UNOBSERVED, *(label for _, label in geoms)], np.uint8)
         self._rays = _rays(camera)
-        with _quiet_warp() as warp:
-            import mujoco_warp
+        start_engine()
+        import mujoco_warp
+        import warp
 
-            self._warp, self._render = warp, mujoco_warp
-            with warp.ScopedDevice("cpu"):
-                self._device_model = mujoco_warp.put_model(self._model)
-                self._device_data = mujoco_warp.put_data(self._model, self._data)
-                self._context = mujoco_warp.create_render_context(
-                    self._model,
-                    1,
-                    cam_res=(camera.width, camera.height),
-                    render_rgb=True,
-                    render_depth=True,
-                    render_seg=True,
-                    use_shadows=True,
-                    use_fast_math=False,
-                    shadow_light_fraction=_SHADOW,
-                    enable_per_light_ambient=False,
-                )
+        self._warp, self._render = warp, mujoco_warp
+        with warp.ScopedDevice("cpu"):
+            self._device_model = mujoco_warp.put_model(self._model)
+            self._device_data = mujoco_warp.put_data(self._model, self._data)
+            self._context = mujoco_warp.create_render_context(
+                self._model,
+                1,
+                cam_res=(camera.width, camera.height),
+                render_rgb=True,
+                render_depth=True,
+                render_seg=True,
+                use_shadows=True,
+                use_fast_math=False,
+                shadow_light_fraction=_SHADOW,
+                enable_per_light_ambient=False,
+            )
 
     def look(self, world_from_camera: Array, time_s: float = 0.0) -> Sight:
         """What the camera sees from a pose (4, 4) of its optical frame; `time_s` places who walks about."""
         warp = self._warp
-        with _quiet_warp(), warp.ScopedDevice("cpu"):
+        with warp.ScopedDevice("cpu"):
             self._place_walker(time_s)
             self._place_camera(world_from_camera)
             self._render.render(self._device_model, self._device_data, self._context)
@@ -244,8 +241,8 @@ class _Builder:
             colours.append(part.look.colours[0])
         sheet, place = divmod(colours.index(part.look.colours[0]), _EDGE**2)
         row, column = divmod(place, _EDGE)
-        uv = np.broadcast_to(np.array([column + 0.5, row + 0.5], np.float32) / _EDGE, part.mesh.uv.shape)
-        return _Paint(shine, glow, sheet), replace(part.mesh, uv=uv)
+        centre = np.array([(column + 0.5) / _EDGE, (row + 0.5) / _EDGE], np.float32)
+        return _Paint(shine, glow, sheet), replace(part.mesh, uv=np.broadcast_to(centre, part.mesh.uv.shape))
 
     def _add_geom(self, body: mujoco.MjsBody, shape: Mesh, material: str, meaning: tuple[int, int]) -> None:
         name = f"g{len(self.geoms)}"
@@ -362,39 +359,6 @@ def _difference(points: NDArray[np.float32], hits: NDArray[np.int32], axis: int)
     pad[axis] = (1, 0)
     before = np.pad(ahead, pad, mode="edge")
     return np.where(after_same[..., None], after, before)
-
-
-@contextlib.contextmanager
-def _quiet_warp() -> Iterator[Any]:
-    """The warp package, set up once: no greeting, no word about missing graphics cards, a folder it may write to."""
-    import warp
-
-    if warp.config.log_level != warp.LOG_ERROR:
-        warp.config.log_level = warp.LOG_ERROR
-        if not _writable(Path(warp.config.kernel_cache_dir or Path.home() / ".cache")):
-            warp.config.kernel_cache_dir = tempfile.mkdtemp(prefix="semslam-kernels-")
-        with _no_stderr():
-            warp.init()  # type: ignore[no-untyped-call]
-    yield warp
-
-
-def _writable(folder: Path) -> bool:
-    """If one could create files in a folder, which need not exist yet."""
-    existing = next((path for path in (folder, *folder.parents) if path.exists()), Path("/"))
-    return os.access(existing, os.W_OK)
-
-
-@contextlib.contextmanager
-def _no_stderr() -> Iterator[None]:
-    """Warp's native code says on stderr that there is no CUDA driver; on a machine without one that is no news."""
-    kept = os.dup(2)
-    with open(os.devnull, "wb") as nothing:
-        os.dup2(nothing.fileno(), 2)
-    try:
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
 
 
 assert LIGHTS == 4  # the renderer is compiled for this many
