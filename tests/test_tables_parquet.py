@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
 
 from semslam.tables.parquet import TableError, TableFiles, TableFileWriter, write_table
@@ -96,3 +97,32 @@ def test_tables_use_known_types_and_distinct_names() -> None:
     for table in ALL_TABLES:
         assert {c.type for c in table.columns} <= set(TYPES)
         assert len({c.name for c in table.columns}) == len(table.columns)
+
+
+def test_lists_are_stored_small(tmp_path: Path) -> None:
+    """Every column but the pictures is compressed, the values of lists too; rising cell numbers take a byte or so."""
+    path = tmp_path / "true.parquet"
+    counts = {"list<uint32>": list(range(20_000)), "list<float32>": [0.5] * 20_000, "list<int64>": list(range(20_000))}
+    values = _ONE | counts
+    row = {column.name: [values[column.type]] for column in OBSERVATIONS.columns}
+    write_table(path, OBSERVATIONS, row)
+    group = pq.ParquetFile(path).metadata.row_group(0)
+    codecs = {group.column(i).path_in_schema: group.column(i).compression for i in range(group.num_columns)}
+    assert set(codecs.values()) == {"ZSTD"}, codecs
+    assert TableFiles(OBSERVATIONS, [path]).read() == row
+    assert path.stat().st_size < 30_000
+
+
+_ONE: dict[str, Any] = {
+    "bool": True,
+    "int8": 1,
+    "int32": 1,
+    "int64": 1,
+    "uint16": 1,
+    "uint32": 1,
+    "uint64": 1,
+    "float32": 0.5,
+    "float64": 0.5,
+    "string": "a",
+    "list<float64>": [0.5],
+}

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from semslam.errors import SemslamError
-from semslam.tables.spec import SPEC_VERSION, Table
+from semslam.tables.spec import SPEC_VERSION, Column, Table
 
 _ARROW = {
     "bool": pa.bool_(),
@@ -62,13 +62,15 @@ class TableFileWriter:
         self._pending_bytes = 0
         self.rows = 0
         plain = [c.name for c in table.columns if c.type == "binary"]
+        whole_numbers = [c for c in table.columns if c.type in ("list<int64>", "list<uint32>")]
         self._writer = pq.ParquetWriter(
             path,
             self._schema,
-            compression={c.name: "none" if c.name in plain else "zstd" for c in table.columns},
+            compression={_leaf(c): "none" if c.name in plain else "zstd" for c in table.columns},
             use_dictionary=[c.name for c in table.columns if c.type == "string"],
+            column_encoding={_leaf(c): "DELTA_BINARY_PACKED" for c in whole_numbers},
             write_page_checksum=True,
-            write_statistics=[c.name for c in table.columns if c.name not in plain],
+            write_statistics=[_leaf(c) for c in table.columns if c.name not in plain],
             store_schema=True,
         )
 
@@ -164,6 +166,11 @@ class TableFiles:
             for name in names:
                 whole[name] += batch[name]
         return whole
+
+
+def _leaf(column: Column) -> str:
+    """What Parquet calls the values of a column: those of a list have a path of their own."""
+    return f"{column.name}.list.element" if column.type.startswith("list<") else column.name
 
 
 def _array(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
