@@ -12,11 +12,14 @@ from typing import Any
 from semslam.logs.messages import (
     CameraInfo,
     CompressedImage,
+    FloorObject,
+    FloorObjects,
     Image,
     Imu,
-    Message,
     Odometry,
+    Polygon,
     Pose,
+    Sent,
     Transform,
     Transforms,
 )
@@ -61,12 +64,12 @@ class CdrBuffer:
         return bytes(self._parts)
 
 
-def ros2_type(message: Message | Transform) -> str:
+def ros2_type(message: Sent) -> str:
     """Full name of the ROS 2 type that carries `message`."""
     return _TYPES[type(message)][0]
 
 
-def serialise(message: Message | Transform) -> bytes:
+def serialise(message: Sent) -> bytes:
     """The bytes of `message` as its ROS 2 type.
 
     Raises:
@@ -134,6 +137,34 @@ def _transforms(buffer: CdrBuffer, message: Transforms) -> None:
         _transform(buffer, transform)
 
 
+def _polygon(buffer: CdrBuffer, polygon: Polygon) -> None:
+    buffer.header(polygon.stamp_nanos, polygon.frame_id)
+    _points(buffer, polygon.points)
+
+
+def _points(buffer: CdrBuffer, points: Sequence[tuple[float, float]]) -> None:
+    """geometry_msgs/Polygon, at height 0."""
+    buffer.pack("I", len(points))
+    for x, y in points:
+        buffer.pack("f", x, y, 0.0)
+
+
+def _floor_objects(buffer: CdrBuffer, message: FloorObjects) -> None:
+    buffer.header(message.stamp_nanos, message.frame_id)
+    buffer.pack("I", len(message.objects))
+    for found in message.objects:
+        _floor_object(buffer, found)
+
+
+def _floor_object(buffer: CdrBuffer, found: FloorObject) -> None:
+    buffer.pack("I", found.id)
+    buffer.text(found.class_name)
+    buffer.text(found.style)
+    buffer.pack("d", *found.position, *found.orientation)
+    _points(buffer, found.footprint)
+    buffer.pack("d", found.height_m)
+
+
 _TYPES: dict[type, tuple[str, Callable[[CdrBuffer, Any], None]]] = {
     Image: ("sensor_msgs/msg/Image", _image),
     CompressedImage: ("sensor_msgs/msg/CompressedImage", _compressed_image),
@@ -141,6 +172,8 @@ _TYPES: dict[type, tuple[str, Callable[[CdrBuffer, Any], None]]] = {
     Imu: ("sensor_msgs/msg/Imu", _imu),
     Odometry: ("nav_msgs/msg/Odometry", _odometry),
     Pose: ("geometry_msgs/msg/PoseStamped", _pose),
+    Polygon: ("geometry_msgs/msg/PolygonStamped", _polygon),
+    FloorObjects: ("semslam_msgs/msg/FloorObjects", _floor_objects),
     Transform: ("geometry_msgs/msg/TransformStamped", _transform),
     Transforms: ("tf2_msgs/msg/TFMessage", _transforms),
 }

@@ -116,3 +116,40 @@ class Transforms:
 
 Message: TypeAlias = Image | CompressedImage | CameraInfo | Imu | Odometry | Pose | Transforms
 """What a decoder returns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Polygon:
+    """An outline on the floor of `frame_id`, metres; sent only."""
+
+    stamp_nanos: int
+    frame_id: str
+    points: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FloorObject:
+    """One object as it stands: what it is, its pose, its outline on the floor in the frame of the list, its height."""
+
+    id: int
+    class_name: str
+    style: str
+    position: Vector
+    """Middle of what it stands on, metres."""
+    orientation: Quaternion
+    footprint: tuple[tuple[float, float], ...]
+    height_m: float
+    """From what it stands on to its top."""
+
+
+@dataclass(frozen=True, slots=True)
+class FloorObjects:
+    """All objects of a place; sent only."""
+
+    stamp_nanos: int
+    frame_id: str
+    objects: tuple[FloorObject, ...]
+
+
+Sent: TypeAlias = Message | Transform | Polygon | FloorObjects
+"""What a writer takes."""

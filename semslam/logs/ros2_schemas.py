@@ -1,6 +1,7 @@
 """Definitions of the ROS 2 messages that this package writes, as `ros2msg` schemas.
 
 Source: the .msg files of common_interfaces, rcl_interfaces (builtin_interfaces) and geometry2 (tf2_msgs), Jazzy.
+Those of semslam_msgs are this package's own: no common type holds an object's outline together with its class and pose.
 """
 
 from __future__ import annotations
@@ -23,6 +24,18 @@ float64 z
 float64 x
 float64 y
 float64 z
+""",
+    "geometry_msgs/Point32": """\
+float32 x
+float32 y
+float32 z
+""",
+    "geometry_msgs/Polygon": """\
+Point32[] points
+""",
+    "geometry_msgs/PolygonStamped": """\
+std_msgs/Header header
+Polygon polygon
 """,
     "geometry_msgs/Quaternion": """\
 float64 x 0
@@ -110,6 +123,22 @@ geometry_msgs/TwistWithCovariance twist
 """,
     "tf2_msgs/TFMessage": """\
 geometry_msgs/TransformStamped[] transforms
+""",
+    "semslam_msgs/FloorObject": """\
+# One object as it stands on the floor or on a piece of furniture.
+uint32 id
+string class_name
+string style
+# Middle of what it stands on, x towards its front, in the frame of the list.
+geometry_msgs/Pose pose
+# Outline of its projection on the floor, in the frame of the list, counter-clockwise.
+geometry_msgs/Polygon footprint
+# From what it stands on to its top, metres.
+float64 height
+""",
+    "semslam_msgs/FloorObjects": """\
+std_msgs/Header header
+FloorObject[] objects
 """,
 }
 """Text by short type name. A field type without a package is of the same package."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from semslam.errors import SemslamError
 from semslam.logs.cdr import ros2_type, serialise
-from semslam.logs.messages import Message, Transform
+from semslam.logs.messages import Sent
 from semslam.logs.ros2_schemas import ros2_schema
 from semslam.logs.rvl import encode_rvl
 
@@ -30,6 +30,8 @@ RVL_DEPTH_FORMAT = "16UC1; compressedDepth rvl"
 _COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 _DEPTH_HEADER = struct.pack("<iff", 0, 0.0, 0.0)
 """Of integer depth: no quantisation."""
+_SMALL = [cv2.IMWRITE_PNG_COMPRESSION, 6, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
+"""For images of few values: a filter would only hide that they repeat."""
 
 
 class LogWriteError(SemslamError):
@@ -95,12 +97,11 @@ class Ros2LogWriter:
             self._file = self._writer = None
             self._partial.unlink(missing_ok=True)
 
-    def write(
-        self, topic: str, message: Message | Transform, log_time_nanos: int, publish_time_nanos: int | None = None
-    ) -> None:
+    def write(self, topic: str, message: Sent, log_time_nanos: int, publish_time_nanos: int | None = None) -> None:
         """Append one message; its type decides the ROS 2 type of the topic.
 
-        `Transforms` becomes tf2_msgs/msg/TFMessage, `Pose` geometry_msgs/msg/PoseStamped, the others their namesakes.
+        `Transforms` becomes tf2_msgs/msg/TFMessage, `Pose` geometry_msgs/msg/PoseStamped, `Polygon`
+        geometry_msgs/msg/PolygonStamped, the others their namesakes.
 
         Args:
             log_time_nanos: when the recorder got it.
@@ -164,7 +165,7 @@ class _Topic:
         self.sequence = 0
 
 
-def _serialised(topic: str, message: Message | Transform, *times_nanos: int) -> bytes:
+def _serialised(topic: str, message: Sent, *times_nanos: int) -> bytes:
     """The bytes of a message, before anything of it is in the log."""
     if not all(0 <= time < 2**64 for time in times_nanos):
         raise LogWriteError(f"A message for `{topic}` has the time {min(times_nanos)} ns, which does not fit a log")
@@ -179,9 +180,17 @@ def encode_jpeg(rgb: NDArray[np.uint8], quality: int = 90) -> bytes:
     return _encode(".jpg", np.ascontiguousarray(rgb[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
-def encode_png_depth(depth_mm: NDArray[np.uint16]) -> bytes:
-    """The data of a `compressedDepth` message with a PNG, see `PNG_DEPTH_FORMAT`. (H, W) uint16, 0 where missing."""
-    return _DEPTH_HEADER + _encode(".png", np.ascontiguousarray(depth_mm, np.uint16), [])
+def encode_png_depth(depth_mm: NDArray[np.uint16], *, small: bool = False) -> bytes:
+    """The data of a `compressedDepth` message with a PNG, see `PNG_DEPTH_FORMAT`. (H, W) uint16, 0 where missing.
+
+    `small` suits depth in coarse steps of disparity: half the bytes for four times the time.
+    """
+    return _DEPTH_HEADER + _encode(".png", np.ascontiguousarray(depth_mm, np.uint16), _SMALL if small else [])
+
+
+def encode_png(pixels: NDArray[np.uint8 | np.uint16]) -> bytes:
+    """A PNG file of ids (H, W), 8 or 16 bits as they come."""
+    return _encode(".png", np.ascontiguousarray(pixels), _SMALL)
 
 
 def encode_rvl_depth(depth_mm: NDArray[np.uint16]) -> bytes:
