@@ -1,9 +1,9 @@
-"""Accuracy on simulated rooms that nobody chose: seeds 1 to 5 of the demo's room, path and noise.
+"""Accuracy on simulated homes that nobody chose: the first log of the first homes of `semslam simulate --seed 1`.
 
-    python benchmarks/seeds.py [--seeds 5] [--quick]
+    python benchmarks/seeds.py [--homes 5] [--steps 30] [--quick]
 
 Prints what `semslam evaluate` prints: every estimator beside dead reckoning (the baseline), chance and standing still.
-The seed that `semslam demo` uses was chosen, for its picture and for little wheel drift; these were not.
+The home of `semslam demo` was chosen for its picture; these were not.
 """
 
 from __future__ import annotations
@@ -16,26 +16,35 @@ from pathlib import Path
 
 from machine import machine
 
-from semslam.sim.demo import demo_settings, record_demo
+from semslam.pipeline.demo import demo_settings
+from semslam.sim.dataset import Recipe
+from semslam.sim.simulate import simulate
 
 
 def main() -> None:
     """Record, run, evaluate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--quick", action="store_true", help="one seed, four keyframes: only to see that it runs")
+    parser.add_argument("--homes", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=30)
+    parser.add_argument("--quick", action="store_true", help="one home, four keyframes: only to see that it runs")
     args = parser.parse_args()
-    seeds, keyframes = (1, 4) if args.quick else (args.seeds, 30)
+    recipe = Recipe(scenes=1 if args.quick else args.homes, trajectories=1, steps=4 if args.quick else args.steps)
     print(machine())
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        logs = [
-            str(record_demo(folder / f"seed{seed}.mcap", seed=seed, keyframes=keyframes))
-            for seed in range(1, seeds + 1)
-        ]
+        simulate(folder / "homes", recipe)
         command = [sys.executable, "-m", "semslam.pipeline.cli"]
         detector = str(demo_settings()["extract.detector"])
-        run = [*command, "run", *logs, "--out", str(folder / "out"), "--detector", detector, "--quiet"]
+        run = [
+            *command,
+            "run",
+            str(folder / "homes" / "logs"),
+            "--out",
+            str(folder / "out"),
+            "--detector",
+            detector,
+            "--quiet",
+        ]
         subprocess.run(run, check=True)
         done = subprocess.run([*command, "evaluate", str(folder / "out")], check=True, capture_output=True, text=True)
         print(done.stdout)

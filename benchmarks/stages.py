@@ -26,8 +26,8 @@ from machine import machine
 
 from semslam.logs.messages import CameraInfo, Image, Imu
 from semslam.logs.writer import Ros2LogWriter
+from semslam.pipeline.demo import demo_log, demo_settings
 from semslam.pipeline.threads import ONE_THREAD
-from semslam.sim.demo import demo_settings, record_demo
 
 _DECODE = """
 import sys, cv2, numpy as np
@@ -166,7 +166,7 @@ def main() -> None:
     print(machine("mcap", "mcap-ros2-support", "onnxruntime", "opencv-contrib-python-headless", "numpy"))
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        log = args.log or record_demo(folder / "demo.mcap", keyframes=4 if args.quick else 30)
+        log = args.log or demo_log()
         detector = args.detector or str(demo_settings()["extract.detector"])
         options = ["--detector", detector, *(["--classes", args.classes] if args.classes else [])]
         ingest(log, folder)

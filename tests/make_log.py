@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from semslam.sim.toy.recording import Plan, ToyTruth, record
+from tests.toy.recording import Plan, ToyTruth, record
 
 __all__ = ["ToyTruth", "make_log"]
 

@@ -12,6 +12,8 @@ from semslam.stages.catalogue import STAGES
 from semslam.tables.spec import ALL_TABLES, SPEC_VERSION, Column, Table
 
 PAGE = Path(__file__).parent.parent / "data_spec.md"
+COMMANDS = {"evaluate", "simulate"}
+"""They write tables, and are no stages."""
 
 
 def section(table: Table) -> str:
@@ -49,7 +51,7 @@ def test_writers_are_the_stages_that_declare_the_table() -> None:
     """`stage` of a table is the stage that writes it, in the catalogue and on the page."""
     written = {table.name: stage.name for stage in STAGES for table in stage.writes}
     for table in ALL_TABLES:
-        assert written.get(table.name, "evaluate") == table.stage
+        assert written.get(table.name) == table.stage or table.stage in COMMANDS - set(written.values())
         assert f"Written by `{table.stage}`" in section(table)
 
 

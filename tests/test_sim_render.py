@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semslam.geometry.camera import Camera
-from semslam.sim.toy.furniture import Material, Solid
-from semslam.sim.toy.render import Renderer, View, pinhole, visible_boxes
-from semslam.sim.toy.robot import base_pose, mount, optical, plan_path
-from semslam.sim.toy.toyroom import CLASSES, ToyRoom, make_room
+from tests.toy.furniture import Material, Solid
+from tests.toy.render import Renderer, View, pinhole, visible_boxes
+from tests.toy.robot import base_pose, mount, optical, plan_path
+from tests.toy.toyroom import CLASSES, ToyRoom, make_room
 
 CAMERA = pinhole(160, 120, math.radians(90))
 GREY = Material("plain", (0.5, 0.5, 0.5), (0.4, 0.4, 0.4))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semslam.sim.toy.robot import (
+from tests.toy.robot import (
     GRAVITY_M_S2,
     DrivePath,
     ImuNoise,
@@ -21,7 +21,7 @@ from semslam.sim.toy.robot import (
     optical,
     plan_path,
 )
-from semslam.sim.toy.toyroom import make_room
+from tests.toy.toyroom import make_room
 
 TIMES = np.arange(0, 20, 0.01)
 SILENT = ImuNoise(0, 0, 0, 0)

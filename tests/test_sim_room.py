@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from semslam.sim.toy.robot import ROBOT_RADIUS_M, clearance_at, clearance_grid, plan_path
-from semslam.sim.toy.toyroom import CLASSES, RoomObject, ToyRoom, make_room, overlap
+from tests.toy.robot import ROBOT_RADIUS_M, clearance_at, clearance_grid, plan_path
+from tests.toy.toyroom import CLASSES, RoomObject, ToyRoom, make_room, overlap
 
 SEEDS = range(40)
 

@@ -16,8 +16,8 @@ from semslam.geometry.frames import SE2
 from semslam.geometry.grid import to_dense
 from semslam.labels import FIRST_OBJECT, FREE_FLOOR, OBSTACLE, UNOBSERVED
 from semslam.pipeline.job import Outcome
-from semslam.sim.toy.render import Renderer, visible_boxes
-from semslam.sim.toy.toyroom import CLASSES
+from tests.toy.render import Renderer, visible_boxes
+from tests.toy.toyroom import CLASSES
 from semslam.stages.catalogue import EXTRACT, INGEST
 from semslam.stages.settings import ExtractConfig, IngestConfig
 from semslam.tables.spec import DETECTIONS, OBSERVATIONS

@@ -1,19 +1,20 @@
-"""Trains the detector of `semslam demo` on random toy rooms and writes the ONNX file and its card.
+"""Trains the detector of `semslam demo` on simulated homes and writes the ONNX file and its card.
 
-    pip install -e ".[train]"
+    pip install -e ".[sim,train]"
     python tools/train_demo_detector.py
 
-Data: pictures of rooms that the demo never uses, with the boxes of their visible pixels as truth. Network: a small
-anchor-free convolutional detector with two output levels (strides 8 and 16), trained with task-aligned assignment
-(Feng et al. 2021, TOOD) as YOLOv8 does. Output layout is that of YOLOv8: (1, 4 + classes, cells), boxes as centre x,
-centre y, width, height in input pixels, then class probabilities. One CPU, no GPU; the same seed and the same number
-of threads give the same file.
+Data: pictures of homes that neither the demo nor the data sets of `semslam simulate` use (their seeds start at a
+million), with the boxes of their visible pixels as truth. Network: a small anchor-free convolutional detector with two
+output levels (strides 8 and 16), trained with task-aligned assignment (Feng et al. 2021, TOOD) as YOLOv8 does. Output
+layout is that of YOLOv8: (1, 4 + classes, cells), boxes as centre x, centre y, width, height in input pixels, then
+class probabilities. One CPU, no GPU; the same seed and the same number of threads give the same file.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
+import multiprocessing
 import pickle
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -28,17 +29,21 @@ import torch.nn.functional as F  # noqa: N812 - the name everybody uses
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from semslam.sim.toy.render import Renderer, View, pinhole, visible_boxes
-from semslam.sim.toy.robot import base_pose, mount, optical, plan_path
-from semslam.sim.toy.toyroom import CLASSES, make_room
+from semslam.geometry.camera import Camera
+from semslam.sim.boxes import TrueBox, true_boxes
+from semslam.sim.eye import Eye, Sight
+from semslam.sim.home import CLASSES, Array, Home
+from semslam.sim.layout import VARIANTS, free_raster, make_home
 
 WIDTH, HEIGHT = 320, 240
 STRIDES = (8, 16)
-TRAIN_ROOMS = range(10_000, 10_400)
-TEST_ROOMS = range(20_000, 20_030)
-VIEWS_A_ROOM = 8
+TRAIN_HOMES = range(1_000_000, 1_000_150)
+TEST_HOMES = range(2_000_000, 2_000_020)
+VIEWS_A_HOME = 12
+SHRINK = 2
+"""Pictures are rendered this many times larger than the network's input, as cameras are."""
 MIN_PIXELS, MIN_SIDE_PX, MIN_SHARE = 120, 8, 0.25
-"""An object counts from this many visible pixels, this side and this visible share of its silhouette on; lesser
+"""An object counts from this many visible pixels of the input, this side and this share of its silhouette on; lesser
 glimpses are neither wanted nor punished."""
 FLAT_PIXELS = 20
 DATA = Path(__file__).resolve().parent.parent / "semslam" / "data"
@@ -59,7 +64,7 @@ def main() -> None:
     torch.manual_seed(args.seed)
     torch.set_num_threads(args.threads)
     torch.use_deterministic_algorithms(True)
-    train, test = _examples(args.cache, "train", TRAIN_ROOMS), _examples(args.cache, "test", TEST_ROOMS)
+    train, test = _examples(args, "train", TRAIN_HOMES), _examples(args, "test", TEST_HOMES)
     print(f"{len(train)} pictures to train on, {len(test)} to test on", flush=True)
     network = fit(train, steps=args.steps, batch=args.batch, seed=args.seed)
     target = Path(args.out)
@@ -76,6 +81,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--steps", type=int, default=3500)
     parser.add_argument("--batch", type=int, default=16)
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=2, help="processes that render")
     parser.add_argument("--cache", default="", help="folder to keep the rendered pictures in")
     parser.add_argument("--out", default=str(DATA / "demo_detector.onnx"))
     return parser.parse_args()
@@ -84,45 +90,71 @@ def _arguments() -> argparse.Namespace:
 # Data
 
 
-def _examples(cache: str, name: str, rooms: Sequence[int]) -> list[Example]:
-    stored = Path(cache) / f"{name}.pickle"
-    if cache and stored.exists():
+def _examples(args: argparse.Namespace, name: str, homes: Sequence[int]) -> list[Example]:
+    """Rendered by as many processes as asked for; order and content do not depend on their number."""
+    stored = Path(args.cache) / f"{name}.pickle"
+    if args.cache and stored.exists():
         rows: list[Example] = pickle.loads(stored.read_bytes())
         return rows
-    examples = [example for seed in rooms for example in _room_examples(seed)]
-    if cache:
+    with multiprocessing.get_context("spawn").Pool(args.workers) as pool:
+        examples = [example for found in pool.imap(_home_examples, homes, chunksize=2) for example in found]
+    if args.cache:
         stored.parent.mkdir(parents=True, exist_ok=True)
         stored.write_bytes(pickle.dumps(examples))
     return examples
 
 
-def _room_examples(seed: int) -> Iterator[Example]:
-    """Views of one room from along its path, by cameras of different height, pitch and field of view."""
+def _home_examples(seed: int) -> list[Example]:
+    """Views of one home from free floor, by cameras of different height, pitch and field of view."""
     rng = np.random.default_rng([seed, 0xDE7])
-    room = make_room(seed)
-    renderer, path = Renderer(room), plan_path(room, seed)
-    for time_s in rng.uniform(0, 60, VIEWS_A_ROOM):
-        camera = pinhole(WIDTH, HEIGHT, float(np.deg2rad(rng.uniform(70, 95))))
-        pitch = float(np.deg2rad(rng.uniform(2, 28)))
-        link = mount(0.1, float(rng.uniform(-0.1, 0.1)), float(rng.uniform(0.45, 0.75)), pitch_rad=pitch)
-        wander = np.eye(4)
-        wander[:2, :2] = _turn(float(rng.normal(0, 0.5)))
-        pose = base_pose(path, float(time_s)) @ wander @ link @ optical()
-        yield _example(renderer.view(camera, pose), renderer.silhouettes(camera, pose))
+    home = make_home(seed, VARIANTS[0] if rng.random() < 0.8 else "rooms")
+    examples: list[Example] = []
+    lens = _lens(rng)
+    eye, spots = Eye(home, lens), _spots(home)
+    for _ in range(4 * VIEWS_A_HOME):
+        if len(examples) == VIEWS_A_HOME:
+            break
+        pose = _pose(rng, spots)
+        sight = eye.look(pose)
+        seen = [box for box in true_boxes(home, sight, lens, pose) if box.pixels >= FLAT_PIXELS * SHRINK**2]
+        if len(seen) >= 2:  # a look at a wall teaches little
+            examples.append(_example(sight, seen))
+    return examples
 
 
-def _turn(angle: float) -> NDArray[np.float64]:
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+def _lens(rng: np.random.Generator) -> Camera:
+    """A pinhole of 70 to 95 degrees."""
+    width, height = WIDTH * SHRINK, HEIGHT * SHRINK
+    focal = width / 2 / np.tan(np.deg2rad(rng.uniform(70, 95)) / 2)
+    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
-def _example(view: View, silhouettes: NDArray[np.int64]) -> Example:
-    seen = visible_boxes(view, min_pixels=FLAT_PIXELS)
-    boxes = np.array([(b.left, b.top, b.right, b.bottom) for b in seen], np.float32).reshape(-1, 4)
+def _spots(home: Home) -> Array:
+    """(N, 2) free places, 0.3 m from everything."""
+    free, origin = free_raster(home)
+    far = cv2.distanceTransform(free.astype(np.uint8), cv2.DIST_L2, 5) * 0.05 > 0.3
+    return np.argwhere(far)[:, ::-1] * 0.05 + np.asarray(origin) + 0.025
+
+
+def _pose(rng: np.random.Generator, spots: Array) -> Array:
+    """A camera somewhere, 0.3 to 0.75 m up, nose level to 20 degrees down."""
+    heading, pitch = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.uniform(0, 20))
+    ahead = np.array([np.cos(heading) * np.cos(pitch), np.sin(heading) * np.cos(pitch), -np.sin(pitch)])
+    right = np.array([np.sin(heading), -np.cos(heading), 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([right, np.cross(ahead, right), ahead])
+    pose[:3, 3] = (*spots[int(rng.integers(len(spots)))], rng.uniform(0.3, 0.75))
+    return pose
+
+
+def _example(sight: Sight, seen: list[TrueBox]) -> Example:
+    boxes = np.array([(b.left, b.top, b.right, b.bottom) for b in seen], np.float32).reshape(-1, 4) / SHRINK
     classes = np.array([b.class_id for b in seen], np.int64)
     sides = np.minimum(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1])
-    pixels, whole = np.array([b.pixels for b in seen]), silhouettes[[b.object_id for b in seen]]
-    counts = (pixels >= MIN_PIXELS) & (sides >= MIN_SIDE_PX) & (pixels >= MIN_SHARE * whole)
-    done, jpeg = cv2.imencode(".jpg", view.rgb[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+    pixels, share = np.array([b.pixels for b in seen]) / SHRINK**2, np.array([b.share for b in seen])
+    counts = (pixels >= MIN_PIXELS) & (sides >= MIN_SIDE_PX) & (share >= MIN_SHARE)
+    small = cv2.resize(sight.rgb, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+    done, jpeg = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
     if not done:
         raise RuntimeError("OpenCV could not encode a picture")
     return Example(jpeg.tobytes(), boxes[counts], classes[counts], boxes[~counts])
@@ -479,8 +511,8 @@ def card(
     )
     return f"""# demo_detector.onnx
 
-The detector of `semslam demo`: finds {", ".join(CLASSES)} in pictures of the simulated rooms of `semslam.sim`. It is
-a toy, trained on simulated rooms only, and is of no use on photographs.
+The detector of `semslam demo`: finds {", ".join(CLASSES)} in pictures of the simulated homes of `semslam.sim`. It is
+a toy, trained on simulated homes only, and is of no use on photographs.
 
 | | |
 |---|---|
@@ -489,14 +521,14 @@ a toy, trained on simulated rooms only, and is of no use on photographs.
 | output | `output0` (1, {4 + len(CLASSES)}, {len(cell_centres()[1])}), YOLOv8 layout, boxes in input pixels |
 | classes | metadata key `names` |
 | network | anchor-free, strides 8 and 16, {sum(p.numel() for p in Detector().parameters())} parameters |
-| data | {pictures[0]} pictures of rooms {TRAIN_ROOMS.start} to {TRAIN_ROOMS.stop - 1}, rendered by `semslam.sim` |
+| data | {pictures[0]} pictures of homes {TRAIN_HOMES.start} to {TRAIN_HOMES.stop - 1}, rendered by `semslam.sim` |
 | command | `python tools/train_demo_detector.py --seed {args.seed} --steps {args.steps} --batch {args.batch} \
 --threads {args.threads}` |
 | torch | {torch.__version__} |
 | date | 2026-11-22 |
 | licence | Apache-2.0, model and data |
 
-Measured on {pictures[1]} pictures of rooms {TEST_ROOMS.start} to {TEST_ROOMS.stop - 1}, which were not trained on:
+Measured on {pictures[1]} pictures of homes {TEST_HOMES.start} to {TEST_HOMES.stop - 1}, which were not trained on:
 IoU 0.5, score 0.3 and above, objects that show {MIN_PIXELS} pixels or more and {MIN_SHARE:.0%} of their silhouette.
 
 | class | precision | recall |

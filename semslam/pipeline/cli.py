@@ -170,6 +170,7 @@ def _run_options(command: _Command) -> _Command:
     return _applied(_config_options(_applied(command, end)), own)
 
 
+_VARIANTS = "Kind of homes: standard, plain, repeating, symmetric, rooms, person; repeatable."
 _json_option = click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")
 _out_argument = click.argument("out", type=click.Path(path_type=Path))
 
@@ -235,21 +236,19 @@ def cli() -> None:
 @click.option("--quiet", is_flag=True, help="Only warnings and errors.")
 @click.pass_context
 def demo(context: click.Context, out: Path, workers: int | None, as_json: bool, quiet: bool) -> int:
-    """Try it on a simulated robot.
+    """Try it on a bundled log.
 
-    Records half a minute of a small robot in a furnished room and makes its maps. Opens nothing; says where to look.
+    Makes the map of a furnished home from half a minute of a small robot's log. Opens nothing; says where to look.
 
     \b
     Example:
       semslam demo --out semslam_demo
     """
-    from semslam.pipeline.folder import create_folder
+    from semslam.pipeline.demo import demo_log, demo_settings
     from semslam.pipeline.run import RunRequest, run
-    from semslam.sim.demo import demo_settings
 
-    settings = demo_settings()
+    log, settings = demo_log(), demo_settings()
     console = _console(quiet=quiet)
-    log = _demo_log(create_folder(out).root / "demo.mcap", console)
     request = RunRequest([str(log)], out, _stages(context)[-1].name, "demo", options=settings, workers=workers)
     outcome = run(request, _stages(context), console)
     if as_json:
@@ -257,6 +256,55 @@ def demo(context: click.Context, out: Path, workers: int | None, as_json: bool, 
     elif not outcome.exit_code:
         console.say(f"log: {log}\nnext: `semslam evaluate {out}` compares the tracks with the simulated truth")
     return outcome.exit_code
+
+
+@cli.command()
+@click.argument("out", type=click.Path(path_type=Path), default=Path("indoor_scenes"))
+@click.option("--scenes", type=int, default=30, show_default=True, help="Homes of every variant.")
+@click.option("--trajectories", type=int, default=3, show_default=True, help="Logs of every home and day.")
+@click.option("--steps", type=int, default=80, show_default=True, help="Keyframes of a log.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Of everything random.")
+@click.option(
+    "--variant", "variants", multiple=True, default=("standard",), show_default=True, metavar="NAME", help=_VARIANTS
+)
+@click.option("--days", type=int, default=1, show_default=True, help="2: every home again, with furniture moved.")
+@click.option("--rate", type=float, default=1.0, show_default=True, metavar="HZ", help="Most keyframes a second.")
+@click.option("--noise", default="standard", show_default=True, help="Of IMU and wheels: none, half, standard, triple.")
+@click.option("--size", default="640x480", show_default=True, metavar="WxH", help="Of the pictures, in pixels.")
+@click.option("--workers", type=click.IntRange(0), help="Processes; 0: none but this. Default: by processors.")
+@click.option("--replace", is_flag=True, help="Make anew what OUT holds with other options.")
+@click.option("--verify", is_flag=True, help="Read finished logs to see that they are whole.")
+@_json_option
+@click.option("--quiet", is_flag=True, help="Only warnings and errors.")
+def simulate(out: Path, workers: int | None, as_json: bool, quiet: bool, **given: Any) -> int:
+    """Record simulated homes as ordinary MCAP logs, with exact truth.
+
+    OUT gets logs/, truth/ and splits.parquet, the same bytes whenever the options are the same. Killed, it goes on
+    where it was; with more scenes or trajectories it grows. Needs `pip install 'semslam[sim]'`.
+
+    \b
+    Example:
+      semslam simulate --scenes 4 --trajectories 3 --variant standard --variant rooms
+    """
+    from semslam.pipeline.simulate_view import SimulateView, say_simulated
+    from semslam.sim.dataset import Recipe, size_of
+    from semslam.sim.engine import require_engine
+    from semslam.sim.simulate import simulate as make
+
+    replace, verify = given.pop("replace"), given.pop("verify")
+    width, height = size_of(given.pop("size"))
+    recipe = Recipe(rate_hz=given.pop("rate"), width=width, height=height, **given)
+    require_engine()
+    console = _console(quiet=quiet)
+    view = SimulateView(console)
+    try:
+        report = make(out, recipe, workers=workers, replace=replace, verify=verify, listener=view)
+    finally:
+        view.close()
+    say_simulated(console, report)
+    if as_json:
+        _print_json(report.as_json())
+    return 1 if report.failures else 0
 
 
 @cli.command()
@@ -529,17 +577,6 @@ def models_inspect(file: Path, as_json: bool) -> None:
     from semslam.models.inspect import describe
 
     _print(describe(file), as_json)
-
-
-def _demo_log(path: Path, console: Console) -> Path:
-    """The demo's log, recorded if it is not there yet."""
-    from semslam.pipeline.files import TEMPORARY
-    from semslam.sim.demo import record_demo
-
-    if not path.exists():
-        console.say(f"recording a simulated robot to {path}")
-        record_demo(path.with_name(f"{TEMPORARY}{path.name}")).replace(path)
-    return path
 
 
 def _check(context: click.Context, given: Mapping[str, Any]) -> int:

@@ -289,6 +289,55 @@ EVALUATION = Table(
     ),
 )
 
+SPLITS = Table(
+    "splits",
+    12,
+    "simulate",
+    (
+        _c("log", "string", "", "log name: the file is `logs/NAME.mcap`"),
+        _c("variant", "string", "", "kind of home: standard, plain, repeating, symmetric, rooms or person"),
+        _c("scene", "int32", "", "number of the home, from 0; its variants and its days share it"),
+        _c("day", "int32", "", "day of the home, from 0"),
+        _c("trajectory", "int32", "", "number of the drive through the scene, from 0"),
+        _c("intra", "string", "", "train or test; null if the scene has a single trajectory", null=True),
+        _c("cross", "string", "", "train or test; null if the data set has a single scene", null=True),
+    ),
+)
+
+TRUE_MAP = Table(
+    "true_map",
+    13,
+    "simulate",
+    (
+        _c("cell_m", "float64", "m", "side of a cell: which grid of the metadata the row belongs to"),
+        _c("row", "int32", "", "cell along y, from 0 at the lowest y"),
+        _c("column", "int32", "", "cell along x, from 0 at the lowest x"),
+        _c("x_m", "float64", "m", "cell centre in the map frame"),
+        _c("y_m", "float64", "m", "cell centre in the map frame"),
+        _c("class_id", "uint16", "", "true class, an index into the class list; unobserved cells have no row"),
+        _c("first_seen_frame", "int32", "", "keyframe to which the cell was visible first; null if to none", null=True),
+    ),
+)
+
+HOME_OBJECTS = Table(
+    "home_objects",
+    14,
+    "simulate",
+    (
+        _c("instance", "int32", "", "id in the instance images, from 1"),
+        _c("class_id", "uint16", "", "index into the class list"),
+        _c("label", "string", "", "its name"),
+        _c("style", "string", "", "kind of chair, table, ..."),
+        _c("x_m", "float64", "m", "middle of the footprint in the home's frame, that of the truth topics"),
+        _c("y_m", "float64", "m", "likewise"),
+        _c("z_m", "float64", "m", "height of what it stands on; 0 is the floor"),
+        _c("yaw_rad", "float64", "rad", "direction of its front"),
+        _c("height_m", "float64", "m", "from what it stands on to its top"),
+        _c("footprint", "list<float64>", "m", "outline in the home's frame, counter-clockwise: x, y, x, y, ..."),
+    ),
+)
+
 ALL_TABLES: tuple[Table, ...] = (
     TOPICS, FRAMES, MOTION, TRUTH, DETECTIONS, OBSERVATIONS, POSES, SNAPSHOTS, CELLS, TRAJECTORY, EVALUATION,
+    SPLITS, TRUE_MAP, HOME_OBJECTS,
 )  # fmt: skip

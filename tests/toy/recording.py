@@ -42,9 +42,9 @@ from semslam.logs.writer import (
     encode_png_depth,
     encode_rvl_depth,
 )
-from semslam.sim.toy import robot
-from semslam.sim.toy.render import Renderer, pinhole
-from semslam.sim.toy.toyroom import RoomObject, ToyRoom, make_room
+from tests.toy import robot
+from tests.toy.render import Renderer, pinhole
+from tests.toy.toyroom import RoomObject, ToyRoom, make_room
 
 COLOUR_FRAME, DEPTH_FRAME, IMU_FRAME = "camera_color_optical_frame", "camera_depth_optical_frame", "imu_link"
 _START_NANOS = 1_773_480_600_000_000_000

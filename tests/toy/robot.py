@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.sim.toy.toyroom import ToyRoom, turn
+from tests.toy.toyroom import ToyRoom, turn
 
 Array = NDArray[np.float64]
 

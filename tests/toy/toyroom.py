@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.sim.toy.furniture import PIECES, Colour, Material, Piece, Solid, pick, shade
+from tests.toy.furniture import PIECES, Colour, Material, Piece, Solid, pick, shade
 
 CLASSES: tuple[str, ...] = tuple(PIECES)
 """Class names; a class id of the simulator is an index into them."""

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semslam.geometry.camera import Camera
-from semslam.sim.toy.furniture import Solid
-from semslam.sim.toy.texture import noise
-from semslam.sim.toy.toyroom import turn
+from tests.toy.furniture import Solid
+from tests.toy.texture import noise
+from tests.toy.toyroom import turn
 
 FLOOR, WALL, CEILING = 0, 1, 2
 """Surfaces of the room itself."""

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.sim.toy.casting import CEILING, FLOOR, WALL, corners_of
-from semslam.sim.toy.furniture import Colour, Solid
-from semslam.sim.toy.texture import PATTERNS
-from semslam.sim.toy.toyroom import ToyRoom
+from tests.toy.casting import CEILING, FLOOR, WALL, corners_of
+from tests.toy.furniture import Colour, Solid
+from tests.toy.texture import PATTERNS
+from tests.toy.toyroom import ToyRoom
 
 _SHADOW_CELL_M = 0.02
 _SUN = np.array([0.45, 0.30, 0.84]) / np.linalg.norm([0.45, 0.30, 0.84])

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semslam.geometry.camera import Camera
-from semslam.sim.toy.casting import SHELL, cast_shell, cast_solid, corners_of, directions, ray_xy, screen_window
-from semslam.sim.toy.shading import Surfaces, floor_light, occlusion
-from semslam.sim.toy.toyroom import ToyRoom
+from tests.toy.casting import SHELL, cast_shell, cast_solid, corners_of, directions, ray_xy, screen_window
+from tests.toy.shading import Surfaces, floor_light, occlusion
+from tests.toy.toyroom import ToyRoom
 
 
 @dataclass(frozen=True)
