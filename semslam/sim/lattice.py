@@ -43,7 +43,7 @@ _SPEED_M_S = 0.33
 _TURN_RAD_S = 0.8
 _DREAD = np.array([40.0, 15.0, 1.5, 0.5, 0.2, 0.1])
 """By how much a second with 0, 1, 2, ... objects in view is dreaded; none beyond the list."""
-_SWERVE = 2
+_SWERVE = 1
 """Bearings by which the robot's heading may differ from that of the lattice."""
 _CROWDED_M = 0.4
 
@@ -158,6 +158,12 @@ def _costs(lattice: Lattice) -> tuple[Array, Array]:
     return drive, (following - _BEARING) * 2 * math.pi / BEARINGS / _TURN_RAD_S * _worst(dread, _BEARING, following)
 
 
+def _leaving(turn: Array) -> Array:
+    """(P, HEADINGS) cost of a quarter turn to the left or to the right, whichever is less."""
+    quarter = np.stack([np.roll(turn, -step, axis=1) for step in range(HEADINGS // 4)]).sum(0)
+    return np.minimum(quarter, np.roll(quarter, HEADINGS // 4, axis=1))
+
+
 def _worst(dread: Array, first: NDArray[np.int64], last: NDArray[np.int64]) -> Array:
     """(P, HEADINGS) most dreaded bearing of each range, both ends included."""
     ranges = [np.arange(low, high + 1) % BEARINGS for low, high in zip(first, last, strict=True)]
@@ -184,11 +190,14 @@ class Reach:
 
 
 class Search:
-    """Dijkstra over the states of a lattice; costs lie in plain lists, which Python reads faster than arrays."""
+    """Dijkstra over the states of a lattice; costs lie in plain lists, which Python reads faster than arrays.
+
+    `leave_s` (P, HEADINGS) is the cost of turning away by about a right angle, to the better side.
+    """
 
     def __init__(self, lattice: Lattice) -> None:
         drive, turn = _costs(lattice)
-        self.shape = drive.shape
+        self.shape, self.leave_s = drive.shape, _leaving(turn)
         heading = np.arange(HEADINGS)
         self._next = np.where(lattice.ahead < 0, -1, lattice.ahead * HEADINGS + heading).ravel().tolist()
         self._drive, self._left = drive.ravel().tolist(), turn.ravel().tolist()

@@ -170,7 +170,8 @@ class Route:
         floor = float(_OLD[0] < age[-1] < _OLD[1]) if back else (age.mean() + age[-1]) / 2
         steps = np.hypot(*np.diff(self.lattice.places[places], axis=0).T).sum()
         good = 2.0 * seen + 4.0 * fresh + 5.0 * floor + steps / max(cost, 1e-9)
-        return float(good - retraced - poor.max() - 3.0 * poor.mean())
+        bad = retraced + poor.max() + 3.0 * poor.mean() + 0.1 * self._search.leave_s[way[-1]]
+        return float(good - bad)
 
     def _remember(self, way: list[tuple[int, int]], time_s: float) -> None:
         """What the way will have seen and visited when it is done; its length in time is close enough."""
