@@ -19,9 +19,9 @@ from semslam.logs.decode import decoder_for
 from semslam.logs.images import decode_colour, decode_depth
 from semslam.logs.messages import CompressedImage, Image, Message, Odometry, Pose, Transforms
 from semslam.logs.reader import LogReader
+from tests.make_log import make_log
 from tests.toy.recording import Plan, record
 from tests.toy.render import Renderer
-from tests.make_log import make_log
 
 COLOUR, DEPTH = "/camera/color/image_raw/compressed", "/camera/depth/image_raw/compressedDepth"
 

@@ -16,14 +16,14 @@ from semslam.geometry.frames import SE2
 from semslam.geometry.grid import to_dense
 from semslam.labels import FIRST_OBJECT, FREE_FLOOR, OBSTACLE, UNOBSERVED
 from semslam.pipeline.job import Outcome
-from tests.toy.render import Renderer, visible_boxes
-from tests.toy.toyroom import CLASSES
 from semslam.stages.catalogue import EXTRACT, INGEST
 from semslam.stages.settings import ExtractConfig, IngestConfig
 from semslam.tables.spec import DETECTIONS, OBSERVATIONS
 from tests.make_log import ToyTruth, make_log
 from tests.onnx_factory import constant_detector, dense
 from tests.stage_room import Done, run_stage, try_stage
+from tests.toy.render import Renderer, visible_boxes
+from tests.toy.toyroom import CLASSES
 
 SIZE = (160, 120)
 NAMES = {"names": str(dict(enumerate(CLASSES)))}

@@ -161,7 +161,7 @@ def _costs(lattice: Lattice) -> tuple[Array, Array]:
 def _leaving(turn: Array) -> Array:
     """(P, HEADINGS) cost of a quarter turn to the left or to the right, whichever is less."""
     quarter = np.stack([np.roll(turn, -step, axis=1) for step in range(HEADINGS // 4)]).sum(0)
-    return np.minimum(quarter, np.roll(quarter, HEADINGS // 4, axis=1))
+    return np.asarray(np.minimum(quarter, np.roll(quarter, HEADINGS // 4, axis=1)))
 
 
 def _worst(dread: Array, first: NDArray[np.int64], last: NDArray[np.int64]) -> Array:

@@ -140,7 +140,7 @@ class Route:
         if len(np.unique(self._rooms)) < 2 or time_s - memory.entered_s < memory.stay_s:
             return None
         known = np.where(np.isin(np.arange(len(memory.room_s)), self._rooms), memory.room_s, np.inf)
-        return int(known.argmin())
+        return int(self._rng.choice(np.flatnonzero(known == known.min())))
 
     def _choose(self, reach: Reach, time_s: float, room: int | None) -> list[tuple[int, int]]:
         """The way to the best of some random goals."""
