@@ -94,8 +94,8 @@ def test_help_and_refusals_load_nothing_heavy() -> None:
         (["--steps", "0"], "`--steps 0` makes no data set", "`--steps` takes 1 to 100000"),
         (["--days", "3"], "`--days 3` makes no data set", "`--days` takes 1 to 2"),
         (["--seed", "-1"], "`--seed -1` makes no data set", "`--seed` takes 0 to 2147483647"),
-        (["--rate", "0"], "`--rate 0` makes no data set", "`--rate` takes 0.01 to 30"),
-        (["--rate", "nan"], "`--rate nan` makes no data set", "`--rate` takes 0.01 to 30"),
+        (["--rate", "0"], "`--rate 0` makes no data set", "`--rate` takes 0.01 to 10"),
+        (["--rate", "nan"], "`--rate nan` makes no data set", "`--rate` takes 0.01 to 10"),
         (["--noise", "tripel"], "There is no `--noise tripel`", "did you mean `--noise triple`?"),
         (["--variant", "cave"], "There is no `--variant cave`", "one of standard, plain,"),
         (

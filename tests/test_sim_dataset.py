@@ -378,6 +378,23 @@ def test_foreign_folders_and_files_are_left_alone(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "full").iterdir()) == ["thesis.tex"]
 
 
+@pytest.mark.parametrize(
+    "plan",
+    [
+        "{",
+        '{"format": "semslam data set", "version": 1, "recipe": {}}',
+        '{"format": "semslam data set", "version": 1, "recipe": {}, "versions": {}, "logs": [1]}',
+    ],
+)
+def test_a_damaged_plan_is_said_to_be_damaged(tmp_path: Path, plan: str) -> None:
+    """Cut or meddled with: an error that names the file, nothing overwritten."""
+    make(tmp_path / "out")
+    (tmp_path / "out" / "plan.json").write_text(plan)
+    with pytest.raises(SemslamError, match=r"plan\.json` is damaged"):
+        make(tmp_path / "out")
+    assert (tmp_path / "out" / "plan.json").read_text() == plan
+
+
 def test_a_stranger_among_the_logs_is_refused_and_never_removed(tmp_path: Path) -> None:
     """A log that somebody put there would be taken for part of the data set."""
     make(tmp_path / "out")

@@ -133,12 +133,20 @@ def test_log_time_rises_and_is_later_than_the_stamps(exact: LogReceipt) -> None:
 
 def test_logs_begin_on_different_days(tmp_path: Path) -> None:
     """The date follows from the seed, in some daytime of 2025 or 2026."""
-    starts = [start_nanos(seed) for seed in range(50)]
+    homes = [replace(box_home(), seed=seed) for seed in range(50)]
+    starts = [start_nanos(home, home.seed) for home in homes]
     assert len({start // (86400 * 10**9) for start in starts}) > 35
     assert all(1_735_689_600 < start / 1e9 < 1_777_600_000 for start in starts)
     assert all(8 <= start / 1e9 % 86400 / 3600 <= 18 for start in starts)
+    days = [
+        [start_nanos(replace(home, day=day), drive) // (86400 * 10**9) for drive in range(3)]
+        for home in homes[:9]
+        for day in (0, 1)
+    ]
+    assert all(len(set(day)) == 1 for day in days), "drives of one day share its date"
+    assert all(1 <= after[0] - before[0] <= 14 for before, after in zip(days[::2], days[1::2], strict=True))
     receipt = record(tmp_path / "log.mcap", box_drive(1), seed=7)
-    assert receipt.stamps_nanos == (start_nanos(7) + 412_300_000,)
+    assert receipt.stamps_nanos == (start_nanos(box_home(), 7) + 412_300_000,)
 
 
 def test_nothing_outside_the_truth_says_simulated(exact: LogReceipt) -> None:
@@ -244,7 +252,7 @@ def test_outline_and_true_poses_are_in_the_frame_of_the_home(exact: LogReceipt) 
     found = official(exact.path)
     (polygon,) = found["/ground_truth/outline"]
     assert [(p.x, p.y) for p in polygon.polygon.points] == [(-3, -2.5), (3, -2.5), (3, 2.5), (-3, 2.5)]
-    drive, begin = box_drive(5), start_nanos(1)
+    drive, begin = box_drive(5), start_nanos(box_home(), 1)
     for message in ours(exact.path, "/ground_truth/pose")["/ground_truth/pose"][::20]:
         assert isinstance(message, Pose)
         expected = drive.world_from_base((message.stamp_nanos - begin) / 1e9)

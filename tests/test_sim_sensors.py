@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from typing import Any
 
 import cv2
@@ -190,21 +189,3 @@ def test_the_same_randomness_gives_the_same_frames() -> None:
     first, again, other = (measure_rgb(sight.rgb, np.random.default_rng(seed)) for seed in (3, 3, 4))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
-
-
-def test_a_frame_costs_little() -> None:
-    """Both sensors together take a fraction of what rendering takes (0.4 s): less than 0.2 s of a slow processor."""
-    big = BoxSight(
-        picture(),
-        np.full((480, 640), 3.0, np.float32),
-        np.zeros((480, 640), np.uint16),
-        np.full((480, 640), 2, np.uint8),
-        np.ones((480, 640), np.float32),
-    )
-    rng = np.random.default_rng(0)
-    measured(big)
-    measure_rgb(picture(), rng)
-    start = time.process_time()
-    measured(big)
-    measure_rgb(picture(), rng)
-    assert time.process_time() - start < 0.2

@@ -208,7 +208,7 @@ def test_what_hides_behind_something_is_not_visible(fine: TrueMap) -> None:
 @pytest.mark.parametrize("shift", [0.0, 0.02, 0.04, 0.06, 0.08])
 def test_walls_are_visible_wherever_they_lie_on_the_grid(shift: float) -> None:
     """A wall that is looked at becomes a row of obstacles, even where its front coincides with the border of cells."""
-    home, drive = box_home(()), box_drive(1)
+    home = box_home(())
     pose = np.eye(4)
     pose[0, 3] = shift
     level = {"world_from_base": lambda _: pose, "keyframes_s": np.array([0.4])}
@@ -223,7 +223,6 @@ def test_walls_are_visible_wherever_they_lie_on_the_grid(shift: float) -> None:
         rows = [math.floor((y - grid.origin_y_m) / grid.cell_m) for y in np.arange(-1.5, 1.6, 0.1)]
         visible = seen.first_seen[rows][:, column : column + 2] == 0
         assert (visible & (seen.class_ids[rows][:, column : column + 2] == OBSTACLE)).any(1).all()
-    assert drive.contacts == 0
 
 
 def test_people_are_in_no_map(tmp_path: Path, folder: Path) -> None:

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 from semslam.sim.home import Array, Home
-from semslam.sim.outlook import fixture_top, stands
+from semslam.sim.outlook import fixture_top
+from semslam.sim.space import stops_robot
 
 WHEEL_RADIUS_M = 0.033
 TRACK_M = 0.16
@@ -81,7 +82,7 @@ def _wheel_xml(name: str, left_m: float) -> str:
 
 def obstacles_xml(home: Home) -> str:
     """Walls along the outlines of everything that can be bumped into, and around the home."""
-    outlines = [(np.asarray(item.footprint), fixture_top(home, item)) for item in home.fixtures if stands(item)]
+    outlines = [(np.asarray(item.footprint), fixture_top(home, item)) for item in home.fixtures if stops_robot(item)]
     outlines += [(item.footprint, item.z_m + item.piece.height_m) for item in home.objects]
     outlines += [(fence, home.height_m) for fence in _fences(home)]
     return "\n".join(_edge_xml(a, b, top) for line, top in outlines for a, b in _edges(_simplified(line)))

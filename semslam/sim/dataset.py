@@ -27,9 +27,19 @@ SIM_VERSION = 1
 VARIANTS = ("standard", "plain", "repeating", "symmetric", "rooms", "person")
 NOISES = ("none", "half", "standard", "triple")
 _PREFIXES = {"standard": "home"}
-_LIBRARIES = ("mujoco", "mujoco-warp", "warp-lang", "numpy", "opencv-contrib-python-headless")
+_LIBRARIES = (
+    "mujoco",
+    "mujoco-warp",
+    "warp-lang",
+    "numpy",
+    "opencv-contrib-python-headless",
+    "mcap",
+    "pyarrow",
+    "zstandard",
+)
 _MOST = {"scenes": 1000, "trajectories": 100, "days": 2, "steps": 100_000}
-_FASTEST_HZ, _SLOWEST_HZ = 30.0, 0.01
+_FASTEST_HZ, _SLOWEST_HZ = 10.0, 0.01
+_LONGEST_S = 6 * 3600
 _SMALLEST_PX, _LARGEST_PX = 32, 4096
 _LARGEST_SEED = 2**31 - 1
 
@@ -68,6 +78,12 @@ class Recipe:
             _require_number(f"--{name}", getattr(self, name), 1, most)
         _require_number("--seed", self.seed, 0, _LARGEST_SEED)
         _require_number("--rate", self.rate_hz, _SLOWEST_HZ, _FASTEST_HZ)
+        hours = self.steps / self.rate_hz / 3600
+        if hours * 3600 > _LONGEST_S:
+            raise UsageError(
+                f"`--steps {self.steps}` at `--rate {self.rate_hz:.15g}` are {hours:.1f} hours of driving",
+                hint=f"a log lasts {_LONGEST_S // 3600} hours at most: fewer `--steps`, or a higher `--rate`",
+            )
         _require_name("--noise", self.noise, NOISES)
         for variant in self.variants or ("",):
             _require_name("--variant", variant, VARIANTS)

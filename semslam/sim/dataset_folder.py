@@ -108,8 +108,8 @@ class DataSetFolder:
         path = self.root / _PLAN
         if not path.exists():
             return None
-        found = _read_json(path)
-        if not isinstance(found, dict) or found.get("format") != FORMAT or not isinstance(found.get("recipe"), dict):
+        found: dict[str, Any] = _read_json(path)
+        if not _is_plan(found):
             raise SemslamError(f"`{path}` is damaged or no plan of a data set", hint="name another folder")
         if found.get("version") != FORMAT_VERSION:
             raise SemslamError(
@@ -218,6 +218,15 @@ def refuse_strangers(folder: DataSetFolder, recordings: Sequence[Recording]) -> 
             f"Among the logs of data set `{folder.root}` lies what was not made there: {shown}",
             hint=f"move it out of `{folder.logs}`",
         )
+
+
+def _is_plan(found: Any) -> bool:
+    """If something read from JSON has the shape of a plan."""
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        return False
+    logs = found.get("logs")
+    shaped = isinstance(found.get("recipe"), dict) and isinstance(found.get("versions"), dict)
+    return shaped and isinstance(logs, list) and all(isinstance(one, dict) for one in logs)
 
 
 def write_json(path: Path, value: Any) -> None:

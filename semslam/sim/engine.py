@@ -75,7 +75,8 @@ def kernel_cache() -> Iterator[dict[str, str]]:
 
 def cache_writable() -> bool:
     """Whether Warp can keep compiled kernels where it wants to; it may have to make the folder first."""
-    folder = Path(os.environ.get(CACHE_VARIABLE) or os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+    shared = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "warp"
+    folder = Path(os.environ.get(CACHE_VARIABLE) or shared)
     existing = next((path for path in (folder, *folder.parents) if path.exists()), Path("/"))
     try:
         with tempfile.TemporaryFile(dir=existing):  # os.access does not know of read-only file systems on all systems

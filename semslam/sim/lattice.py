@@ -130,7 +130,7 @@ def _entrance(home: Home, places: Array) -> int:
     if float(away.min()) > AROUND_START_M:
         raise SemslamError(
             f"Home of seed `{home.seed}` ({home.variant}) has no free floor within {AROUND_START_M:g} m of its start",
-            hint="Choose another seed, or fewer objects.",
+            hint="use another `--seed`",
         )
     return int(away.argmin())
 

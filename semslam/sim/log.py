@@ -194,11 +194,12 @@ def record_log(
     return LogReceipt(path, recording.stamps, tuple(recording.visible), messages, path.stat().st_size)
 
 
-def start_nanos(seed: int) -> int:
-    """When the log of a seed begins: some day, some daytime; Unix time."""
-    rng = np.random.default_rng([seed, 0x5717, 0])
-    day, nanos = int(rng.integers(_START_DAYS)), int(rng.integers(_HOURS * 3600 * 10**9))
-    return (_FIRST_START_S + 86400 * day) * 10**9 + nanos
+def start_nanos(home: Home, seed: int) -> int:
+    """When the log of a seed begins, Unix time: a home has its date, and its next day is one to fourteen days later."""
+    rng = np.random.default_rng([home.seed, 0x5717, 0])
+    date = int(rng.integers(_START_DAYS)) + home.day * int(rng.integers(1, 15))
+    daytime = int(np.random.default_rng([seed, 0x5717, 1]).integers(_HOURS * 3600 * 10**9))
+    return (_FIRST_START_S + 86400 * date) * 10**9 + daytime
 
 
 def visible_count(sight: Sight, home: Home) -> int:
@@ -235,7 +236,7 @@ class _Recording:
     ) -> None:
         self._home, self._robot, self._drive, self._seed = home, robot, drive, seed
         self._options, self._observer, self._eye = options, observer, eye
-        self._start = start_nanos(seed)
+        self._start = start_nanos(home, seed)
         self._colour_camera = draw_colour_camera(self._rng(5))
         level = LEVELS[options.noise]
         self._gyro, self._accel = measure_imu(drive, level, self._rng(1))

@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.sim.home import FLOOR_KINDS, SKY_KINDS, Array, Fixture, Home
+from semslam.sim.home import Array, Fixture, Home
+from semslam.sim.space import stops_robot
 
 CELL_M = 0.1
 """Raster of heights; rays advance by this much too, so that none slips through a wall."""
@@ -56,17 +57,12 @@ def relief_of(home: Home) -> Relief:
     height, instance = np.full(shape, home.height_m, np.float32), np.zeros(shape, np.int64)
     for polygon in home.outline:
         height[_inside(polygon, origin, shape)] = 0.0
-    solids = [(fixture_top(home, item), 0, item.footprint) for item in home.fixtures if stands(item)]
+    solids = [(fixture_top(home, item), 0, item.footprint) for item in home.fixtures if stops_robot(item)]
     solids += [(item.z_m + item.piece.height_m, k + 1, item.footprint) for k, item in enumerate(home.objects)]
     for top, number, footprint in sorted(solids, key=lambda solid: solid[:2]):
         cells = _inside(np.asarray(footprint), origin, shape)
         height[cells], instance[cells] = top, number
     return Relief(height, instance, origin, len(home.objects))
-
-
-def stands(item: Fixture) -> bool:
-    """Whether a fixture stops a robot."""
-    return item.footprint is not None and item.kind not in (*FLOOR_KINDS, *SKY_KINDS)
 
 
 def fixture_top(home: Home, item: Fixture) -> float:

@@ -103,13 +103,23 @@ class Pool(Generic[Task, Result]):
         """
         if self._size == 0:
             for number, task in enumerate(tasks):
-                yield number, self._job(task, lambda done, number=number: progress(number, done))  # type: ignore[misc]
+                yield number, self._job(task, self._told(number, progress))
+                self._tick()
             return
         self._waiting.extend(range(len(tasks)))
         while self._waiting or any(worker.number is not None for worker in self._workers):
             self._hand_out(tasks)
             yield from self._hear(progress)
             self._tick()
+
+    def _told(self, number: int, progress: Callable[[int, int], None]) -> Callable[[int], None]:
+        """What a job in this process reports to."""
+
+        def report(done: int) -> None:
+            progress(number, done)
+            self._tick()
+
+        return report
 
     def _hand_out(self, tasks: Sequence[Task]) -> None:
         """Give waiting tasks to idle workers and to new ones."""

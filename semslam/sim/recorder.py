@@ -7,6 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from semslam.errors import SemslamError
 from semslam.sim.dataset import Recording
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ def record_home(recording: Recording, log: Path, truth: Path, report: Callable[[
     hearing that they are not installed, must not need them.
 
     Raises:
-        SemslamError: the home leaves no way to drive, or a file cannot be written.
+        SemslamError: the home leaves no way to drive, the robot bumped into something, or a file cannot be written.
     """
     from semslam.sim.engine import start_engine
 
@@ -42,6 +43,11 @@ def record_home(recording: Recording, log: Path, truth: Path, report: Callable[[
     robot, seed = draw_robot(recording.home_seed), recording.drive_seed
     free, origin = free_raster(home)
     motion = drive(home, (free, np.asarray(origin)), robot, seed, steps=recording.steps, rate_hz=recording.rate_hz)
+    if motion.contacts:
+        raise SemslamError(
+            f"The robot of `{recording.name}` touched furniture or a wall {motion.contacts} times",
+            hint="use another `--seed`, and report this home",
+        )
     collector = TruthCollector(home, motion, options.camera)
 
     def observe(index: int, stamp_nanos: int, sight: Sight, world_from_camera: Matrix) -> None:
