@@ -3,8 +3,8 @@
     pip install -e ".[sim]"
     python tools/make_demo.py
 
-The home is one that neither the detector's training nor the data sets of `semslam simulate` use. The same versions of
-the packages give the same bytes.
+The home is scene 0 of `semslam simulate --seed 3000`; the detector was trained on others. The same versions of the
+packages give the same bytes.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ topics under `/ground_truth` hold the truth; the pipeline uses none of them but 
 | | |
 |---|---|
 | file | {log.stat().st_size / 1e6:.2f} MB, SHA-256 `{digest}` |
-| home | seed {recording.home_seed}, chosen for its picture and for nothing else |
+| home | seed {recording.home_seed}, the first of its `--seed`, not chosen |
 | noise | `{recording.noise}` (wheels and IMU); camera and depth as sensors have them |
 | objects in view | {min(seen)} to {max(seen)} a frame |
 | command | `python tools/make_demo.py --home {recording.home_seed}` |
