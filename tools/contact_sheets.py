@@ -41,7 +41,7 @@ TILE = (400, 300)
 """Width and height of a frame on the sheet; the plan takes two by two."""
 FRAMES = COLUMNS * ROWS - 4
 HEAD_PX, CAPTION_PX, GAP_PX = 34, 20, 4
-MOST_BYTES = 350_000
+MOST_BYTES = 230_000
 PAPER, INK, ROUTE = (255, 255, 255), (40, 40, 44), (214, 60, 40)
 _NAME = re.compile(r"(?P<kind>[a-z]+)_(?P<scene>\d+)(_d(?P<day>[01]))?\Z")
 
