@@ -488,3 +488,15 @@ def test_a_plan_shows_objects_in_their_colours() -> None:
         columns, rows = np.round((points - (x0 - 0.45, y1 + 0.45)) * (60, -60)).astype(int).T
         wanted = np.array(CLASS_COLOURS[item.class_name])
         assert np.abs(picture[rows, columns].astype(int) - wanted).max(1).min() < 40, item.class_name
+
+
+@pytest.mark.parametrize(("seed", "variant"), [(1007, "standard"), (1011, "rooms"), (1002, "symmetric")])
+def test_a_robot_drives_through_real_homes_without_touching_anything(seed: int, variant: str) -> None:
+    """With physics, real furniture and solid walls, for twenty seconds; and it gets somewhere."""
+    pytest.importorskip("mujoco", reason="needs the simulator: pip install '.[sim]'")
+    from semslam.sim.vehicle import draw_robot, drive
+
+    home = make_home(seed, variant)
+    motion = drive(home, free_raster(home), draw_robot(seed), seed, steps=18)
+    assert motion.contacts == 0
+    assert np.hypot(*np.diff(motion.positions[::20, :2], axis=0).T).sum() > 2.0
