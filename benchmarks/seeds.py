@@ -3,7 +3,7 @@
     python benchmarks/seeds.py [--homes 5] [--steps 30] [--quick]
 
 Prints what `semslam evaluate` prints: every estimator beside dead reckoning (the baseline), chance and standing still.
-The home of `semslam demo` was chosen for its picture; these were not.
+None of them was chosen, nor was the home of `semslam demo`.
 """
 
 from __future__ import annotations

@@ -1,12 +1,14 @@
 """Do detectors trained on photographs recognise simulated furniture?
 
-    python benchmarks/sim_detectors.py DETECTOR.onnx [--classes coco_classes.txt] [--scenes 6] [--frames 30] [--quick]
+    python benchmarks/sim_detectors.py DETECTOR.onnx [--classes coco_classes.txt] [--scenes 6] [--frames 30]
+        [--seed 1] [--min-score 0.3] [--strict] [--pictures FOLDER] [--quick]
 
-Takes the first frames of the first log of the first scenes that `semslam simulate --seed 1` records, with the noise of
-its camera, and prints recall and precision of a COCO detector at IoU 0.5 for the classes that COCO shares. *Whole*
-objects show at least 75 % of their silhouette, 400 pixels and no edge of the picture; detections on lesser glimpses of
-the right class count neither for nor against. An armchair, which is a sofa here and a chair in COCO, may be called
-either; `--strict` takes that back. The baseline is the same boxes against truth of another scene (chance).
+Draws the first frames of the first log of the first scenes that `semslam simulate --seed 1` records, with noise of the
+same kind drawn anew and no JPEG, and prints recall and precision of a COCO detector at IoU 0.5 for the classes that
+COCO shares. *Whole* objects show at least 75 % of their silhouette, 400 pixels and no edge of the picture; detections
+on lesser glimpses of the right class count neither for nor against. An armchair, which is a sofa here and a chair in
+COCO, may be called either; `--strict` takes that back. The baseline is the same boxes against truth of another scene
+(chance).
 """
 
 from __future__ import annotations

@@ -490,6 +490,11 @@ def test_a_plan_shows_objects_in_their_colours() -> None:
         assert np.abs(picture[rows, columns].astype(int) - wanted).max(1).min() < 40, item.class_name
 
 
+def test_the_plan_has_a_colour_for_every_class() -> None:
+    """And for nothing else."""
+    assert set(CLASS_COLOURS) == set(CLASSES)
+
+
 @pytest.mark.parametrize(("seed", "variant"), [(1007, "standard"), (1011, "rooms"), (1002, "symmetric")])
 def test_a_robot_drives_through_real_homes_without_touching_anything(seed: int, variant: str) -> None:
     """With physics, real furniture and solid walls, for twenty seconds; and it gets somewhere."""

@@ -42,6 +42,8 @@ def main() -> None:
     folder = OutputFolder(args.run)
     (record,) = load_records(folder.logs).values()
     mapped = cv2.imread(str(args.run / "results" / record.name / args.estimator / "map.png"))
+    if mapped is None:
+        raise SystemExit(f"the run has no map of `{args.estimator}`")
     camera, observed = _camera(folder, record, args.frame), _observation(folder, record, args.frame)
     left = np.vstack(
         [_titled("What the camera sees", camera), _titled("What one frame says: observation map", observed)]
@@ -54,11 +56,7 @@ def main() -> None:
 
 def _rows(folder: OutputFolder, record: LogRecord, table: Table, frame: int) -> list[dict[str, Any]]:
     """Rows of a table for one keyframe."""
-    entry = EntryIndex(folder.cache).find(table.stage, record.tasks[table.stage].key)
-    if entry is None:
-        raise SystemExit(f"the run has no {table.name}")
-    files = table_files(folder.stage(table.stage) / entry.key)[table.name]
-    columns = TableFiles(table, [Path(file.path) for file in files]).read()
+    columns = _table(folder, record, table).read()
     rows = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
     return [row for row in rows if row["frame"] == frame]
 
@@ -86,7 +84,7 @@ def _camera(folder: OutputFolder, record: LogRecord, frame: int) -> Image:
 
 def _observation(folder: OutputFolder, record: LogRecord, frame: int) -> Image:
     """The observation of the frame: the likeliest class of every cell, the robot in the middle looking right."""
-    meta, row = _meta(folder, record), _rows(folder, record, OBSERVATIONS, frame)[0]
+    meta, row = _table(folder, record, OBSERVATIONS).meta, _rows(folder, record, OBSERVATIONS, frame)[0]
     side, classes = int(meta["side"]), tuple(meta["classes"])
     cells = np.asarray(row["cells"], np.int64)
     class_id, place = cells // side**2, cells % side**2
@@ -99,11 +97,12 @@ def _observation(folder: OutputFolder, record: LogRecord, frame: int) -> Image:
     return _panel(seen, way, class_colours(classes[c] for c in seen.objects()))
 
 
-def _meta(folder: OutputFolder, record: LogRecord) -> Any:
-    entry = EntryIndex(folder.cache).find(OBSERVATIONS.stage, record.tasks[OBSERVATIONS.stage].key)
-    assert entry is not None
-    files = table_files(folder.stage(OBSERVATIONS.stage) / entry.key)[OBSERVATIONS.name]
-    return TableFiles(OBSERVATIONS, [Path(file.path) for file in files]).meta
+def _table(folder: OutputFolder, record: LogRecord, table: Table) -> TableFiles:
+    entry = EntryIndex(folder.cache).find(table.stage, record.tasks[table.stage].key)
+    if entry is None:
+        raise SystemExit(f"the run has no {table.name}")
+    files = table_files(folder.stage(table.stage) / entry.key)[table.name]
+    return TableFiles(table, [Path(file.path) for file in files])
 
 
 def _panel(cells: MapCells, way: Way, colours: dict[str, Colour]) -> Image:

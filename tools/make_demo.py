@@ -3,8 +3,8 @@
     pip install -e ".[sim]"
     python tools/make_demo.py
 
-The home is scene 0 of `semslam simulate --seed 3000`; the detector was trained on others. The same versions of the
-packages give the same bytes.
+It is the first log of `semslam simulate --seed 3000 --scenes 1 --trajectories 1 --steps 30`; the detector was trained
+on other homes. The same versions of the packages give the same bytes.
 """
 
 from __future__ import annotations
@@ -12,22 +12,23 @@ from __future__ import annotations
 import argparse
 import hashlib
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
-from semslam.sim.dataset import Recording, versions
+from semslam.sim.dataset import Recipe, Recording, versions
 from semslam.sim.recorder import record_home
 
 DATA = Path(__file__).resolve().parent.parent / "semslam" / "data"
-HOME_SEED, STEPS = 3_000_000, 30
+RECIPE = Recipe(scenes=1, trajectories=1, steps=30, seed=3000)
 
 
 def main() -> None:
     """Record, then write the card."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--home", type=int, default=HOME_SEED, help="seed of home, robot, drive and noise")
     parser.add_argument("--out", type=Path, default=DATA / "demo_home.mcap")
     args = parser.parse_args()
-    recording = Recording(args.out.stem, "standard", 0, 0, 0, args.home, args.home, STEPS, 1.0, "standard", 640, 480)
+    (first,) = RECIPE.recordings()
+    recording = replace(first, name=args.out.stem)
     with tempfile.TemporaryDirectory() as folder:
         seen = record_home(recording, args.out, Path(folder) / "truth", lambda _: None)
     args.out.with_suffix(".md").write_text(card(args.out, recording, seen), encoding="utf-8")
@@ -46,10 +47,10 @@ topics under `/ground_truth` hold the truth; the pipeline uses none of them but 
 | | |
 |---|---|
 | file | {log.stat().st_size / 1e6:.2f} MB, SHA-256 `{digest}` |
-| home | seed {recording.home_seed}, the first of its `--seed`, not chosen |
+| home | seed {recording.home_seed}: the first of `semslam simulate --seed {RECIPE.seed}`, not chosen |
 | noise | `{recording.noise}` (wheels and IMU); camera and depth as sensors have them |
 | objects in view | {min(seen)} to {max(seen)} a frame |
-| command | `python tools/make_demo.py --home {recording.home_seed}` |
+| command | `python tools/make_demo.py` |
 | versions | {used} |
 | licence | Apache-2.0 |
 """

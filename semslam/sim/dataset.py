@@ -37,6 +37,8 @@ _LIBRARIES = (
     "pyarrow",
     "zstandard",
 )
+_HOMES_A_SEED, _DAYS_A_HOME, _DRIVES_A_DAY = 1000, 2, 100
+"""Strides of seeds. Never change them: homes are known by their seeds. No limit below may exceed its stride."""
 _MOST = {"scenes": 1000, "trajectories": 100, "days": 2, "steps": 100_000}
 _FASTEST_HZ, _SLOWEST_HZ = 10.0, 0.01
 _LONGEST_S = 6 * 3600
@@ -103,7 +105,7 @@ class Recipe:
         ]
 
     def _recording(self, variant: str, scene: int, day: int, trajectory: int) -> Recording:
-        home_seed = self.seed * _MOST["scenes"] + scene
+        home_seed = self.seed * _HOMES_A_SEED + scene
         the_day = f"_d{day}" if self.days > 1 else ""
         return Recording(
             f"{_PREFIXES.get(variant, variant)}_{scene:02}{the_day}_t{trajectory}",
@@ -112,7 +114,7 @@ class Recipe:
             day,
             trajectory,
             home_seed,
-            (home_seed * _MOST["days"] + day) * _MOST["trajectories"] + trajectory,
+            (home_seed * _DAYS_A_HOME + day) * _DRIVES_A_DAY + trajectory,
             self.steps,
             self.rate_hz,
             self.noise,

@@ -19,7 +19,6 @@ from semslam.labels import FIRST_OBJECT, FREE_FLOOR, OBSTACLE, UNOBSERVED
 from semslam.sim.engine import start_engine
 from semslam.sim.home import (
     FLOOR_KINDS,
-    LIGHTS,
     SKY_KINDS,
     Array,
     Colour,
@@ -359,6 +358,3 @@ def _difference(points: NDArray[np.float32], hits: NDArray[np.int32], axis: int)
     pad[axis] = (1, 0)
     before = np.pad(ahead, pad, mode="edge")
     return np.where(after_same[..., None], after, before)
-
-
-assert LIGHTS == 4  # the renderer is compiled for this many

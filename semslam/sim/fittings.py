@@ -111,7 +111,7 @@ def _washstand(extra: Extra, palette: Palette, *, mirror: bool) -> Parts:
     basin = lathe(np.array([[0, 0], [0.11, 0], [0.19, 0.10], [0.20, 0.13], [0.185, 0.13], [0.10, 0.03], [0, 0.03]]))
     parts: Parts = [
         (box((-a + 0.01, -b, 0.12), (a - 0.03, b, high - 0.13)), Look("paint", (palette.accent_wall,), 1.0, shine=0.2)),
-        (box((-a + 0.01, -b - 0.0, high - 0.13), (a, b, high - 0.09)), Look("wood", palette.wood, 0.6)),
+        (box((-a + 0.01, -b, high - 0.13), (a, b, high - 0.09)), Look("wood", palette.wood, 0.6)),
         (box((-a + 0.05, -b + 0.04, 0.0), (a - 0.08, b - 0.04, 0.12)), Look("plain", ((0.16, 0.16, 0.16),))),
         (moved(basin, (0.02, 0.0, high - 0.09)), _WHITE),
         (_tap(-a + 0.05, 0.0, high - 0.09), _STEEL),

@@ -18,7 +18,9 @@ _FADE = (1.0, 0.0, 0.022)
 
 
 def lights_of(shell: Shell, seed: int, *, twins: bool = False) -> tuple[Light, ...]:
-    """One lamp in every room, more in a single room, and daylight; one lamp casts shadows."""
+    """One lamp in every room, more in a single room, and daylight if one of the four lights is left; one lamp casts
+    shadows.
+    """
     rng = np.random.default_rng([seed, 0x11A7])
     if twins:
         return _twin_lights(shell, rng)

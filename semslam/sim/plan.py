@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.sim.home import CLASSES, Array, Fixture, Home, Part, Placed
+from semslam.sim.home import Array, Fixture, Home, Part, Placed
 
 Image = NDArray[np.uint8]
 _Rgb = tuple[int, int, int]
@@ -180,6 +180,3 @@ def _draw_scale(sheet: _Sheet, home: Home) -> None:
     sheet.text("2 m", 0.12, x0 + 2.0, y - 0.13, _INK)
     words = f"{home.variant}, seed {home.seed}, day {home.day}: {len(home.objects)} objects"
     sheet.text(words, 0.15, (x0 + 2.2 + x1) / 2, y - 0.02, _INK)
-
-
-assert set(CLASS_COLOURS) == set(CLASSES)

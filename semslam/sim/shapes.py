@@ -1,4 +1,4 @@
-"""Meshes to build furniture and walls from: boxes, turned and bent things, cushions, sheets, prisms.
+"""Meshes to build furniture and walls from: boxes, turned and bent things, cushions, sheets.
 
 All lengths are metres. Faces are counter-clockwise seen from outside; every vertex carries its normal and its place on
 the texture in metres along the surface, so that a texture has the same scale on every shape.
@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from semslam.sim.home import Array, Mesh, Vector
 
@@ -28,19 +28,6 @@ def box(low: Vector, high: Vector, *, bevel_m: float = 0.0) -> Mesh:
 def cushion(low: Vector, high: Vector, *, bevel_m: float = 0.05, puff_m: float = 0.02) -> Mesh:
     """A box with round edges whose faces bulge by up to `puff_m`, within its corners' bounds grown by that much."""
     return _soft_box(low, high, bevel_m, puff_m)
-
-
-def prism(outline: ArrayLike, z_low_m: float, z_high_m: float, *, smooth: bool = False) -> Mesh:
-    """An upright prism over a simple polygon (N, 2), counter-clockwise; `smooth` rounds the look of its sides."""
-    points = np.asarray(outline, np.float64)
-    bottom, top = (np.column_stack([points, np.full(len(points), z)]) for z in (z_low_m, z_high_m))
-    caps = np.array(triangulate(points), np.int32)
-    parts = [
-        _mesh(top, np.tile((0.0, 0.0, 1.0), (len(top), 1)), points, caps),
-        _mesh(bottom, np.tile((0.0, 0.0, -1.0), (len(bottom), 1)), points, caps[:, ::-1]),
-        _side(points, z_low_m, z_high_m, smooth),
-    ]
-    return merge(parts)
 
 
 def lathe(profile: ArrayLike, *, segments: int = 24) -> Mesh:
@@ -126,21 +113,6 @@ def sheet(points: ArrayLike, *, thick_m: float = 0.001) -> Mesh:
     )
     uv, half = np.stack([v, u], -1), normals * (thick_m / 2)
     return merge([_grid(grid + half, normals, uv, flip=False), _grid(grid - half, -normals, uv, flip=True)])
-
-
-def leaf(base: Vector, heading_rad: float, length_m: float, width_m: float, *, rise: float, bend: float) -> Mesh:
-    """A leaf from `base`: starts at the slope `rise` (1 = 45 degrees up) and bends down by `bend` over its length."""
-    t = np.linspace(0, 1, 7)
-    out, up = t * length_m, (rise * t - (rise + bend) * 0.5 * t * t) * length_m
-    half = width_m / 2 * np.sin(np.pi * np.clip(t * 0.95 + 0.05, 0, 1)) ** 0.7
-    across = np.array([-1.0, 0.0, 1.0])
-    fold = -0.25 * np.abs(across)[None] * half[:, None]
-    local = np.stack(
-        [np.broadcast_to(out[:, None], fold.shape), across[None] * half[:, None], up[:, None] - fold], axis=-1
-    )
-    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
-    frame = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-    return sheet(local @ frame.T + np.asarray(base))
 
 
 def picture_plane(width_m: float, height_m: float) -> Mesh:
@@ -231,41 +203,6 @@ def about_z(angle_rad: float) -> Array:
     return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
 
 
-def bounds(meshes: Iterable[Mesh]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Least and greatest corner of some meshes."""
-    points = np.concatenate([mesh.vertices for mesh in meshes])
-    return points.min(0), points.max(0)
-
-
-def triangulate(outline: Array) -> list[tuple[int, int, int]]:
-    """Triangles of a simple counter-clockwise polygon (N, 2), by cutting ears.
-
-    Raises:
-        ValueError: the outline crosses itself or runs clockwise.
-    """
-    left, triangles = list(range(len(outline))), []
-    while len(left) > 3:
-        ear = next((i for i in range(len(left)) if _is_ear(outline, left, i)), None)
-        if ear is None:
-            raise ValueError("the outline is no simple counter-clockwise polygon")
-        triangles.append((left[ear - 1], left[ear], left[(ear + 1) % len(left)]))
-        left.pop(ear)
-    return [*triangles, (left[0], left[1], left[2])]
-
-
-def _is_ear(outline: Array, left: list[int], i: int) -> bool:
-    a, b, c = (outline[left[k % len(left)]] for k in (i - 1, i, i + 1))
-    area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-    if area <= 1e-12:
-        return len(left) > 3 and abs(area) <= 1e-12
-    others = outline[[k for k in left if not any(np.array_equal(outline[k], corner) for corner in (a, b, c))]]
-    inside = np.ones(len(others), bool)
-    for first, second in ((a, b), (b, c), (c, a)):
-        edge, towards = second - first, others - first
-        inside &= edge[0] * towards[:, 1] - edge[1] * towards[:, 0] > -1e-12
-    return not inside.any()
-
-
 def _mesh(vertices: ArrayLike, normals: ArrayLike, uv: ArrayLike, faces: ArrayLike) -> Mesh:
     return Mesh(
         np.asarray(vertices, np.float32),
@@ -336,25 +273,6 @@ def _soft_face(axis: int, sign: float, half: Array, bevel: float, puff_m: float,
     # upright sides carry their texture upright: the height is the second axis of it
     uv = np.stack([v, u], -1) if second != 2 else np.stack([u, v], -1)
     return _grid(points, normals, uv, flip=sign < 0)
-
-
-def _side(points: Array, z_low_m: float, z_high_m: float, smooth: bool) -> Mesh:
-    """The upright sides of a prism."""
-    closed = np.vstack([points, points[:1]])
-    edges = np.diff(closed, axis=0)
-    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(edges, axis=1))])
-    normals = np.column_stack([edges[:, 1], -edges[:, 0]])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    joint = normals + np.roll(normals, 1, 0)
-    joint /= np.maximum(np.linalg.norm(joint, axis=1, keepdims=True), 1e-12)
-    parts = []
-    for i in range(len(points)):
-        ends = (joint[i], joint[(i + 1) % len(points)]) if smooth else (normals[i], normals[i])
-        corners = [(*closed[k], z) for k in (i, i + 1) for z in (z_low_m, z_high_m)]
-        lean = [(*end, 0.0) for end in ends for _ in range(2)]
-        uv = [(lengths[k], z) for k in (i, i + 1) for z in (z_low_m, z_high_m)]
-        parts.append(_mesh(corners, lean, uv, [[0, 2, 3], [0, 3, 1]]))
-    return merge(parts)
 
 
 def _profile_normals(line: Array) -> list[tuple[Array, Array]]:

@@ -1,7 +1,8 @@
 """Which logs of a data set train and which test, for the two protocols of the paper.
 
 Reads and writes `splits` (data_spec.md, table 12). *Intra-scene*: the last trajectory of every scene tests.
-*Cross-scene*: whole scenes test, with all days and variants of them, because those share walls and furniture.
+*Cross-scene*: whole scenes test, with all days and variants of them, because those share materials and furniture, and
+most of them walls.
 """
 
 from __future__ import annotations

@@ -27,9 +27,9 @@ def tile(look: Look) -> NDArray[np.uint8]:
     Raises:
         KeyError: no such pattern.
     """
-    names = list(PATTERNS)
-    rng = np.random.default_rng([look.seed, names.index(look.pattern) if look.pattern in names else 0, 0x7E7])
-    picture = PATTERNS[look.pattern](look, rng)
+    pattern = PATTERNS[look.pattern]
+    rng = np.random.default_rng([look.seed, list(PATTERNS).index(look.pattern), 0x7E7])
+    picture = pattern(look, rng)
     return np.asarray(np.round(np.clip(picture, 0, 1) * 255), np.uint8)
 
 
@@ -443,16 +443,3 @@ PATTERNS: dict[str, Pattern] = {
     )
 }
 """Patterns by name."""
-
-
-def swatches(looks: dict[str, Look], *, columns: int = 7) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB, a sheet of tiles with their names, for people to look at."""
-    cells = []
-    for name, look in looks.items():
-        cell = np.ascontiguousarray(tile(look)[::-1])
-        cv2.putText(cell, name, (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 3, cv2.LINE_AA)
-        cv2.putText(cell, name, (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 1, cv2.LINE_AA)
-        cells.append(np.pad(cell, ((3, 3), (3, 3), (0, 0)), constant_values=255))
-    while len(cells) % columns:
-        cells.append(np.full_like(cells[0], 255))
-    return np.vstack([np.hstack(cells[i : i + columns]) for i in range(0, len(cells), columns)])

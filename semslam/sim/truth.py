@@ -25,8 +25,9 @@ from semslam.geometry.grid import to_sparse
 from semslam.geometry.levelling import roll_pitch
 from semslam.geometry.projection import observe, points_in_robot
 from semslam.labels import FIRST_OBJECT, FREE_FLOOR, OBSTACLE, UNOBSERVED, class_list
-from semslam.sim.home import FLOOR_KINDS, SKY_KINDS, Array, Home
+from semslam.sim.home import Array, Home
 from semslam.sim.polygons import area_m2, fill
+from semslam.sim.space import stops_robot
 from semslam.tables.parquet import write_table
 from semslam.tables.spec import HOME_OBJECTS, OBSERVATIONS, TRUE_MAP, TRUTH, Table
 from semslam.tables.true_map import NEVER
@@ -79,7 +80,7 @@ class Ground:
         """Draw a home. Raises ValueError for more than 250 objects."""
         if len(home.objects) > 250:
             raise ValueError(f"{len(home.objects)} objects are more than a raster of bytes can tell apart")
-        solids = [f for f in home.fixtures if f.footprint is not None and f.kind not in (*FLOOR_KINDS, *SKY_KINDS)]
+        solids = [fixture for fixture in home.fixtures if stops_robot(fixture)]
         outlines = [(FREE_FLOOR, polygon) for polygon in home.outline]
         outlines += [(OBSTACLE, np.asarray(fixture.footprint)) for fixture in solids]
         numbered = [(FIRST_OBJECT + index, item.footprint) for index, item in enumerate(home.objects)]

@@ -298,6 +298,6 @@ def _settled(spots: list[Spot]) -> tuple[Spot, ...]:
 
 def _side_by_side(first: Spot, second: Spot) -> bool:
     names = {first.piece.class_name, second.piece.class_name}
-    if names == {"chair", "table"} and min(first.piece.height_m, 9) > 0.5:
+    if names == {"chair", "table"} and first.piece.height_m > 0.5:
         return True  # pushed under it, by construction no further than TUCK_M
     return gap_m(first.footprint, second.footprint) > 0.025

@@ -439,7 +439,6 @@ TOILETS: Makers = {"closed": closed, "open": opened, "monobloc": monobloc, "wall
 
 _CHINA = Look("plain", ((0.95, 0.95, 0.94),), shine=0.8)
 _SEAT = Look("plain", ((0.92, 0.92, 0.90),), shine=0.5)
-_TILES = Look("tiles", ((0.86, 0.86, 0.84), (0.70, 0.70, 0.68)), tile_m=0.6, shine=0.5)
 _WATER = Look("plain", ((0.62, 0.70, 0.74),), shine=0.9)
 
 
