@@ -13,7 +13,9 @@ probabilities. One CPU, no GPU; the same seed and the same number of threads giv
 from __future__ import annotations
 
 import argparse
+import datetime
 import hashlib
+import json
 import multiprocessing
 import pickle
 from collections.abc import Iterator, Sequence
@@ -31,6 +33,7 @@ from torch import Tensor, nn
 
 from semslam.geometry.camera import Camera
 from semslam.sim.boxes import TrueBox, true_boxes
+from semslam.sim.dataset import versions
 from semslam.sim.eye import Eye, Sight
 from semslam.sim.home import CLASSES, Array, Home
 from semslam.sim.layout import VARIANTS, free_raster, make_home
@@ -92,7 +95,9 @@ def _arguments() -> argparse.Namespace:
 
 def _examples(args: argparse.Namespace, name: str, homes: Sequence[int]) -> list[Example]:
     """Rendered by as many processes as asked for; order and content do not depend on their number."""
-    stored = Path(args.cache) / f"{name}.pickle"
+    made_of = [versions(), str(homes), VIEWS_A_HOME, SHRINK, FLAT_PIXELS, MIN_PIXELS, MIN_SIDE_PX, MIN_SHARE]
+    key = hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:12]
+    stored = Path(args.cache) / f"{name}-{key}.pickle"
     if args.cache and stored.exists():
         rows: list[Example] = pickle.loads(stored.read_bytes())
         return rows
@@ -511,8 +516,8 @@ def card(
     )
     return f"""# demo_detector.onnx
 
-The detector of `semslam demo`: finds {", ".join(CLASSES)} in pictures of the simulated homes of `semslam.sim`. It is
-a toy, trained on simulated homes only, and is of no use on photographs.
+The detector of `semslam demo`, for pictures of simulated homes. It is a toy, trained on simulated homes only, and is of
+no use on photographs.
 
 | | |
 |---|---|
@@ -525,7 +530,7 @@ a toy, trained on simulated homes only, and is of no use on photographs.
 | command | `python tools/train_demo_detector.py --seed {args.seed} --steps {args.steps} --batch {args.batch} \
 --threads {args.threads}` |
 | torch | {torch.__version__} |
-| date | 2026-11-22 |
+| date | {datetime.date.today()} |
 | licence | Apache-2.0, model and data |
 
 Measured on {pictures[1]} pictures of homes {TEST_HOMES.start} to {TEST_HOMES.stop - 1}, which were not trained on:
