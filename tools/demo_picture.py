@@ -49,7 +49,8 @@ def main() -> None:
         [_titled("What the camera sees", camera), _titled("What one frame says: observation map", observed)]
     )
     height = max(left.shape[0], mapped.shape[0])
-    page = np.hstack([_tall(left, height), np.full((height, GAP, 3), 255, np.uint8), _tall(mapped, height)])
+    gap = np.full((height, GAP, 3), 255, np.uint8)
+    page = np.hstack([gap, _tall(left, height), gap, _tall(mapped, height)])
     cv2.imwrite(str(args.out), page, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     print(f"{args.out}: {page.shape[1]} x {page.shape[0]} pixels, {args.out.stat().st_size / 1000:.0f} kB")
 
