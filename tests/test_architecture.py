@@ -14,6 +14,7 @@ ROOT = Path(semslam.__file__).parent
 BELOW: dict[str, set[str]] = {
     "errors": set(),
     "labels": set(),
+    "processes": set(),
     "metrics": {"errors", "labels", "geometry"},
     "tables": {"errors", "labels"},
     "geometry": {"errors", "labels"},
@@ -21,8 +22,8 @@ BELOW: dict[str, set[str]] = {
     "models": {"errors", "labels", "logs", "geometry", "tables"},
     "slam": {"errors", "labels", "metrics", "models", "logs", "geometry", "tables"},
     "stages": {"errors", "labels", "metrics", "slam", "models", "logs", "geometry", "tables"},
-    "sim": {"errors", "labels", "logs", "geometry", "tables"},
-    "pipeline": {"errors", "labels", "metrics", "stages", "slam", "models", "logs", "geometry", "tables"},
+    "sim": {"errors", "labels", "processes", "logs", "geometry", "tables"},
+    "pipeline": {"errors", "labels", "processes", "metrics", "stages", "slam", "models", "logs", "geometry", "tables"},
 }
 """What each room may import besides itself."""
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from semslam.pipeline.failure import Failure
 from semslam.pipeline.job import Job, Outcome
 from semslam.pipeline.threads import ONE_THREAD
+from semslam.processes import die_with_parent
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -205,7 +205,7 @@ def _work(pipe: Connection[Any, Any]) -> None:
     """The life of a worker process: jobs in, progress and outcomes out, until the pipe ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    _die_with_parent()
+    die_with_parent()
     os.dup2(2, 1)  # stdout belongs to the data of the command; a chatty library must not write into it
     from semslam.pipeline.worker import execute
 
@@ -216,24 +216,3 @@ def _work(pipe: Connection[Any, Any]) -> None:
             return
         outcome = execute(job, lambda done, total: pipe.send(("progress", (job.number, done, total))))  # noqa: B023
         pipe.send(("ended", outcome))
-
-
-def _die_with_parent() -> None:
-    """End this process as soon as its parent is gone, so that nobody writes after a killed run."""
-    import multiprocessing
-    import threading
-    from multiprocessing.connection import wait
-
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, name="parent-watch", daemon=True).start()
-
-
-def usable_cpus() -> int:
-    """Processors this process may use."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1

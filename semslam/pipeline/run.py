@@ -11,12 +11,13 @@ from semslam.errors import SemslamError
 from semslam.pipeline.config import Config, load_config
 from semslam.pipeline.console import Console, RunView, say_end
 from semslam.pipeline.discover import Discovery, Log, discover
-from semslam.pipeline.executors import Executor, ProcessPool, SerialExecutor, usable_cpus
+from semslam.pipeline.executors import Executor, ProcessPool, SerialExecutor
 from semslam.pipeline.folder import OutputFolder, create_folder
 from semslam.pipeline.plan import stages_until, variants_of
 from semslam.pipeline.record import RecordBook
 from semslam.pipeline.report import RunOutcome
 from semslam.pipeline.runner import Runner, RunReport
+from semslam.processes import usable_cpus
 from semslam.stages.contract import Stage
 
 

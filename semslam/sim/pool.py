@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,6 +16,8 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any, Generic, TypeVar
+
+from semslam.processes import die_with_parent
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -231,7 +232,7 @@ def _work(pipe: Connection[Any, Any], job: Job[Any, Any]) -> None:
     """The life of a worker process: tasks in, progress and results out, until the pipe ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    _die_with_parent()
+    die_with_parent()
     os.dup2(2, 1)  # stdout belongs to the data of the command; a chatty library must not write into it
     while True:
         try:
@@ -240,23 +241,3 @@ def _work(pipe: Connection[Any, Any], job: Job[Any, Any]) -> None:
             return
         result = job(task, lambda done: pipe.send(("progress", number, done)))  # noqa: B023
         pipe.send(("ended", number, result))
-
-
-def _die_with_parent() -> None:
-    """End this process as soon as its parent is gone, so that nobody writes after a killed run."""
-    import multiprocessing
-    import threading
-
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, name="parent-watch", daemon=True).start()
-
-
-def usable_cpus() -> int:
-    """Processors this process may use."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from semslam.errors import SemslamError
+from semslam.processes import usable_cpus
 from semslam.sim.dataset import Recipe, Recording
 from semslam.sim.dataset_folder import (
     DataSetFolder,
@@ -30,7 +31,7 @@ from semslam.sim.dataset_folder import (
     write_receipt,
 )
 from semslam.sim.engine import kernel_cache
-from semslam.sim.pool import Died, Pool, usable_cpus
+from semslam.sim.pool import Died, Pool
 from semslam.sim.recorder import record_home
 
 Recorder = Callable[[Recording, Path, Path, Callable[[int], None]], Sequence[int]]
