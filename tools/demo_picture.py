@@ -12,9 +12,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from semslam.geometry import rle
+from semslam.labels import FIRST_OBJECT
 from semslam.pipeline.cache import EntryIndex, table_files
 from semslam.pipeline.folder import OutputFolder
 from semslam.pipeline.record import LogRecord, load_records
@@ -44,7 +46,8 @@ def main() -> None:
     mapped = cv2.imread(str(args.run / "results" / record.name / args.estimator / "map.png"))
     if mapped is None:
         raise SystemExit(f"the run has no map of `{args.estimator}`")
-    camera, observed = _camera(folder, record, args.frame), _observation(folder, record, args.frame)
+    colours = _colours(args.run / "results" / record.name / args.estimator / "map.parquet")
+    camera, observed = _camera(folder, record, args.frame, colours), _observation(folder, record, args.frame, colours)
     left = np.vstack(
         [_titled("What the camera sees", camera), _titled("What one frame says: observation map", observed)]
     )
@@ -55,6 +58,12 @@ def main() -> None:
     print(f"{args.out}: {page.shape[1]} x {page.shape[0]} pixels, {args.out.stat().st_size / 1000:.0f} kB")
 
 
+def _colours(table: Path) -> dict[str, Colour]:
+    """The colours that classes have on the map, which the other pictures share."""
+    columns = pq.read_table(table, columns=["class_id", "label"]).to_pydict()
+    return class_colours(label for class_id, label in zip(*columns.values(), strict=True) if class_id >= FIRST_OBJECT)
+
+
 def _rows(folder: OutputFolder, record: LogRecord, table: Table, frame: int) -> list[dict[str, Any]]:
     """Rows of a table for one keyframe."""
     columns = _table(folder, record, table).read()
@@ -62,12 +71,12 @@ def _rows(folder: OutputFolder, record: LogRecord, table: Table, frame: int) -> 
     return [row for row in rows if row["frame"] == frame]
 
 
-def _camera(folder: OutputFolder, record: LogRecord, frame: int) -> Image:
+def _camera(folder: OutputFolder, record: LogRecord, frame: int, colours: dict[str, Colour]) -> Image:
     """The frame with masks and boxes of what was detected."""
     rgb = decode_colour(_rows(folder, record, FRAMES, frame)[0]["colour"])
     picture = np.ascontiguousarray(rgb[:, :, ::-1])
     found = _rows(folder, record, DETECTIONS, frame)
-    colours = class_colours(sorted({row["label"] for row in found}))
+    colours = class_colours(row["label"] for row in found) | colours
     for row in found:
         mask = rle.decode(row["mask_runs"], *picture.shape[:2])
         picture[mask] = (0.5 * picture[mask] + 0.5 * np.asarray(colours[row["label"]])).astype(np.uint8)
@@ -83,7 +92,7 @@ def _camera(folder: OutputFolder, record: LogRecord, frame: int) -> Image:
     return canvas.image
 
 
-def _observation(folder: OutputFolder, record: LogRecord, frame: int) -> Image:
+def _observation(folder: OutputFolder, record: LogRecord, frame: int, colours: dict[str, Colour]) -> Image:
     """The observation of the frame: the likeliest class of every cell, the robot in the middle looking right."""
     meta, row = _table(folder, record, OBSERVATIONS).meta, _rows(folder, record, OBSERVATIONS, frame)[0]
     side, classes = int(meta["side"]), tuple(meta["classes"])
@@ -95,7 +104,7 @@ def _observation(folder: OutputFolder, record: LogRecord, frame: int) -> Image:
     cell_m = float(meta["cell_m"])
     seen = MapCells(ix - side // 2, iy - side // 2, np.fromiter(best.values(), np.int64), classes, cell_m)
     way = Way(np.zeros(1), np.zeros(1))
-    return _panel(seen, way, class_colours(classes[c] for c in seen.objects()))
+    return _panel(seen, way, class_colours(classes[c] for c in seen.objects()) | colours)
 
 
 def _table(folder: OutputFolder, record: LogRecord, table: Table) -> TableFiles:
