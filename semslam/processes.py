@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import sys
-import threading
-from multiprocessing.connection import wait
 
 
 def die_with_parent() -> None:
     """End this process as soon as its parent is gone, so that nobody writes after a killed run."""
+    import multiprocessing  # here, because counting processors should cost nothing
+    import threading
+    from multiprocessing.connection import wait
+
     parent = multiprocessing.parent_process()
 
     def watch() -> None:
