@@ -555,8 +555,123 @@ def config_check(context: click.Context, file: Path) -> None:
 
 
 @cli.group()
+def train() -> None:
+    """Make training pictures, and train semslam's own detector and segmenter.
+
+    \b
+    Example:
+      semslam train pictures views --homes 200 --views 20 --seed 1000
+      semslam train detector views --out runs/detector
+    """
+
+
+@train.command("pictures")
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option("--homes", type=int, default=200, show_default=True, help="Simulated homes.")
+@click.option("--views", type=int, default=20, show_default=True, help="Pictures of each.")
+@click.option("--seed", type=int, default=1000, show_default=True, help="Homes of `semslam simulate --seed`.")
+@click.option("--unfamiliar", is_flag=True, help="Lights, palettes and cameras that training never uses; for tests.")
+@click.option("--workers", type=click.IntRange(0), help="Processes; 0: none but this. Default: by processors.")
+@_json_option
+@click.option("--quiet", is_flag=True, help="Only warnings and errors.")
+def train_pictures(out: Path, workers: int | None, as_json: bool, quiet: bool, **given: Any) -> int:
+    """Draw views of simulated homes with the truth to learn from.
+
+    OUT gets a Parquet file a home (table 15 of data_spec.md). Killed, it goes on where it was; with more homes it
+    grows. Needs `pip install 'semslam[sim]'`.
+
+    \b
+    Example:
+      semslam train pictures views --homes 200 --views 20 --seed 1000
+    """
+    from semslam.pipeline.train_view import PicturesView, say_pictures
+    from semslam.sim.engine import require_engine
+    from semslam.sim.views import ViewRecipe, make_views
+
+    recipe = ViewRecipe(**given)
+    require_engine()
+    console = _console(quiet=quiet)
+    view = PicturesView(console)
+    try:
+        report = make_views(out, recipe, workers=workers, progress=view.progressed)
+    finally:
+        view.close()
+    say_pictures(console, report)
+    if as_json:
+        _print_json({"out": str(out), "cached": report.cached, "done": report.done, "failed": report.failures})
+    return 1 if report.failures else 0
+
+
+def _training_options(command: _Command) -> _Command:
+    """Options of the commands that train."""
+    return _applied(
+        command,
+        (
+            click.argument("views", type=click.Path(path_type=Path)),
+            click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run."),
+            click.option("--steps", type=click.IntRange(1), help="Default: as the shipped model."),
+            click.option("--batch", type=click.IntRange(1), help="Pictures a step. Default: as the shipped model."),
+            click.option("--rate", type=float, help="Peak learning rate. Default: as the shipped model."),
+            click.option("--seed", type=int, default=1, show_default=True, help="Of everything random."),
+            click.option("--threads", type=click.IntRange(1), default=2, show_default=True, help="Of torch."),
+            click.option("--device", type=click.Choice(("auto", "cpu", "cuda")), default="auto", show_default=True),
+            click.option("--quiet", is_flag=True, help="Only warnings and errors."),
+        )[::-1],
+    )
+
+
+def _train(task: str, given: dict[str, Any]) -> int:
+    """Train a network of a kind and say what came of it."""
+    from semslam.models.extras import require_torch
+    from semslam.pipeline.train_view import TrainingView
+
+    require_torch()
+    from semslam.models.training.runs import TASKS, asked
+
+    console = _console(quiet=given.pop("quiet"))
+    view = TrainingView(console)
+    try:
+        made = TASKS[task].train(asked(task, watch=view.progressed, **given))
+    finally:
+        view.close()
+    for path in made:
+        console.say(f"wrote {path}")
+    return 0
+
+
+@train.command("detector")
+@_training_options
+def train_detector(**given: Any) -> int:
+    """Train the detector on VIEWS and export it as ONNX.
+
+    The run's folder holds a checkpoint: killed, the same command goes on where it was; `curves.csv` has the losses.
+    Needs `pip install 'semslam[train]'`.
+
+    \b
+    Example:
+      semslam train detector views --out runs/detector
+    """
+    return _train("detector", given)
+
+
+@train.command("segmenter")
+@_training_options
+def train_segmenter(**given: Any) -> int:
+    """Train the box-prompted segmenter on VIEWS and export encoder and decoder as ONNX.
+
+    The run's folder holds a checkpoint: killed, the same command goes on where it was; `curves.csv` has the losses.
+    Needs `pip install 'semslam[train]'`.
+
+    \b
+    Example:
+      semslam train segmenter views --out runs/segmenter
+    """
+    return _train("segmenter", given)
+
+
+@cli.group()
 def models() -> None:
-    """Look at networks.
+    """Look at networks and export them.
 
     \b
     Example:
@@ -577,6 +692,34 @@ def models_inspect(file: Path, as_json: bool) -> None:
     from semslam.models.inspect import describe
 
     _print(describe(file), as_json)
+
+
+@models.command("export")
+@click.argument("task", type=click.Choice(("detector", "segmenter")))
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option("--run", "run_folder", type=click.Path(path_type=Path), help="Folder of a training, finished or not.")
+@click.option("--random", "random_seed", type=int, metavar="SEED", help="Randomly initialised instead, from a seed.")
+@click.option(
+    "--classes", type=click.Path(path_type=Path), help="Class names of a random one. Default: simulated homes."
+)
+def models_export(task: str, out: Path, run_folder: Path | None, random_seed: int | None, classes: Path | None) -> int:
+    """Write a network of semslam's own as ONNX into the folder OUT.
+
+    \b
+    Example:
+      semslam models export detector exported --run runs/detector
+      semslam models export segmenter exported --random 1
+    """
+    from semslam.models.extras import require_torch
+
+    if (run_folder is None) == (random_seed is None):
+        raise UsageError("Export what a training learned, or random weights", hint="give `--run` or `--random`")
+    require_torch()
+    from semslam.models.training.runs import TASKS
+
+    for path in TASKS[task].export(out, run_folder, random_seed, classes):
+        _complain(f"wrote {path}")
+    return 0
 
 
 def _check(context: click.Context, given: Mapping[str, Any]) -> int:

@@ -337,7 +337,31 @@ HOME_OBJECTS = Table(
     ),
 )
 
+VIEWS = Table(
+    "views",
+    15,
+    "train",
+    (
+        _c("view", "int32", "", "index within the home, from 0"),
+        _c("colour", "binary", "", "JPEG file"),
+        _c("depth", "binary", "mm", "16-bit PNG file, registered to colour; 0 where missing"),
+        _c("instances", "binary", "", "16-bit PNG file: id of the object of every pixel; 0 is the building and loose things"),
+        _c("fx", "float64", "px", "focal length across"),
+        _c("fy", "float64", "px", "focal length down"),
+        _c("cx", "float64", "px", "principal point across"),
+        _c("cy", "float64", "px", "principal point down"),
+        _c("camera_height_m", "float64", "m", "above the floor"),
+        _c("camera_pitch_rad", "float64", "rad", "nose down is positive"),
+        _c("instance", "list<int64>", "", "ids of the objects in view; this and the next columns have one entry an object"),
+        _c("class_id", "list<int64>", "", "index into the class names of the file's metadata"),
+        _c("boxes_px", "list<float64>", "px", "left, top, right, bottom of the visible pixels, four an object; right and bottom exclusive"),
+        _c("pixels", "list<int64>", "", "visible pixels"),
+        _c("share", "list<float64>", "", "of the silhouette that is visible, 0 to 1; what lies beyond the picture counts as hidden"),
+        _c("cut", "list<int64>", "", "1 if the object touches the edge of the picture, else 0"),
+    ),
+)
+
 ALL_TABLES: tuple[Table, ...] = (
     TOPICS, FRAMES, MOTION, TRUTH, DETECTIONS, OBSERVATIONS, POSES, SNAPSHOTS, CELLS, TRAJECTORY, EVALUATION,
-    SPLITS, TRUE_MAP, HOME_OBJECTS,
+    SPLITS, TRUE_MAP, HOME_OBJECTS, VIEWS,
 )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Training of semslam's own networks (`pip install 'semslam[train]'`); reached only from the command that trains."""

@@ -1,0 +1,162 @@
+"""Pictures to learn from: colour, depth, the object of every pixel, and what can be seen of each object.
+
+Reads   views        data_spec.md, table 15: a folder with one file a home, as `semslam train pictures` leaves it
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semslam.errors import SemslamError
+from semslam.tables.parquet import TableFiles
+from semslam.tables.pictures import decode_colour, decode_depth
+from semslam.tables.spec import VIEWS
+
+MIN_SHARE, MIN_PIXELS, MIN_SIDE_PX = 0.25, 480, 16
+"""An object counts from this share of its silhouette, this many visible pixels and this shorter side on, at 640x480;
+lesser glimpses are neither wanted nor punished."""
+_AREA_PX, _WIDTH_PX = 640 * 480, 640
+
+
+@dataclass(frozen=True)
+class SeenObject:
+    """An object as far as a picture shows it."""
+
+    instance: int
+    class_id: int
+    """Index into the class names of its set."""
+    left: float
+    top: float
+    right: float
+    bottom: float
+    """Edges of its visible pixels; right and bottom exclusive."""
+    pixels: int
+    share: float
+    """Visible share of its silhouette, 0 to 1."""
+    cut: bool
+    """It touches the edge of the picture."""
+
+    def counts(self, width: int, height: int) -> bool:
+        """If a detector should find it in a picture of this size."""
+        enough = self.pixels >= MIN_PIXELS * width * height / _AREA_PX and self.share >= MIN_SHARE
+        return enough and min(self.right - self.left, self.bottom - self.top) >= MIN_SIDE_PX * width / _WIDTH_PX
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A view and its truth."""
+
+    rgb: NDArray[np.uint8]
+    """(H, W, 3)"""
+    depth_m: NDArray[np.float32]
+    """(H, W), 0 where missing."""
+    instances: NDArray[np.uint16]
+    """(H, W) id of the object of every pixel; 0 is no object."""
+    objects: tuple[SeenObject, ...]
+
+    @property
+    def counting(self) -> tuple[SeenObject, ...]:
+        """The objects that a detector should find."""
+        height, width = self.instances.shape
+        return tuple(item for item in self.objects if item.counts(width, height))
+
+    @property
+    def glimpses(self) -> tuple[SeenObject, ...]:
+        """The others."""
+        height, width = self.instances.shape
+        return tuple(item for item in self.objects if not item.counts(width, height))
+
+
+@dataclass(frozen=True, eq=False)
+class PictureSet:
+    """All views of a folder, in memory as the files hold them and decoded when asked for."""
+
+    class_names: tuple[str, ...]
+    rows: Sequence[dict[str, Any]]
+    digest: str
+    """Of names and sizes of the files: another set has another one."""
+
+    @staticmethod
+    def open(folder: Path, *, homes: slice = slice(None)) -> PictureSet:
+        """Open the views of a folder, or of some of its homes.
+
+        Raises:
+            SemslamError: no views there, a damaged file, or files with different classes.
+        """
+        paths = sorted(folder.glob("*.parquet"))[homes]
+        if not paths:
+            raise SemslamError(f"No views in `{folder}`", hint=f"make some: `semslam train pictures {folder}`")
+        files = [TableFiles(VIEWS, [path]) for path in paths]
+        names = {tuple(file.meta["classes"]) for file in files}
+        if len(names) > 1:
+            raise SemslamError(
+                f"Files in `{folder}` disagree about the classes", hint="keep each set in its own folder"
+            )
+        rows = [row for file in files for row in _rows(file)]
+        return PictureSet(names.pop(), rows, _fingerprint(paths))
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, index: int) -> Picture:
+        return _picture(self.rows[index])
+
+    @cached_property
+    def classes_of(self) -> list[frozenset[int]]:
+        """The classes in each view, without decoding it."""
+        return [frozenset(int(number) for number in row["class_id"]) for row in self.rows]
+
+
+def resized(picture: Picture, width: int, height: int) -> Picture:
+    """The picture at another size; the objects' boxes and pixels scale with it."""
+    rows, columns = picture.instances.shape
+    if (rows, columns) == (height, width):
+        return picture
+    across, down = width / columns, height / rows
+    size = (width, height)
+    area = cv2.INTER_AREA if across < 1 else cv2.INTER_LINEAR
+    return Picture(
+        np.asarray(cv2.resize(picture.rgb, size, interpolation=area), np.uint8),
+        np.asarray(cv2.resize(picture.depth_m, size, interpolation=cv2.INTER_NEAREST), np.float32),
+        np.asarray(cv2.resize(picture.instances, size, interpolation=cv2.INTER_NEAREST), np.uint16),
+        tuple(_scaled(item, across, down) for item in picture.objects),
+    )
+
+
+def _scaled(item: SeenObject, across: float, down: float) -> SeenObject:
+    left, right, top, bottom = item.left * across, item.right * across, item.top * down, item.bottom * down
+    pixels = round(item.pixels * across * down)
+    return SeenObject(item.instance, item.class_id, left, top, right, bottom, pixels, item.share, item.cut)
+
+
+def _rows(file: TableFiles) -> list[dict[str, Any]]:
+    columns = file.read()
+    return [{name: values[index] for name, values in columns.items()} for index in range(file.rows)]
+
+
+def _picture(row: dict[str, Any]) -> Picture:
+    instances = cv2.imdecode(np.frombuffer(row["instances"], np.uint8), cv2.IMREAD_UNCHANGED)
+    if instances is None:
+        raise SemslamError("A view's instance image cannot be decoded", hint="make the views again")
+    boxes = np.asarray(row["boxes_px"], np.float64).reshape(-1, 4).tolist()
+    objects = tuple(
+        SeenObject(int(instance), int(class_id), *box, int(pixels), float(share), bool(cut))
+        for instance, class_id, box, pixels, share, cut in zip(
+            row["instance"], row["class_id"], boxes, row["pixels"], row["share"], row["cut"], strict=True
+        )
+    )
+    return Picture(decode_colour(row["colour"]), decode_depth(row["depth"]), np.asarray(instances, np.uint16), objects)
+
+
+def _fingerprint(paths: Sequence[Path]) -> str:
+    text = "\n".join(f"{path.name} {path.stat().st_size}" for path in paths)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
