@@ -53,9 +53,9 @@ from semslam.tables.spec import FRAMES
 detector = Detector.open(Path(sys.argv[1]), classes_path=Path(sys.argv[2]) if sys.argv[2] else None)
 frames = TableFiles(FRAMES, sorted(Path(sys.argv[3]).glob("cache/ingest/*/shard-*/frames.parquet")))
 first = decode_colour(next(frames.batches(["colour"], 0, 1))["colour"][0])
-tensor, _ = detector.adapter.preprocess(first, detector.signature)
+feeds, _ = detector.adapter.preprocess(first, None, detector.signature)
 for _ in range(frames.rows if sys.argv[4] == "run" else 0):
-    detector.session.run({detector.signature.inputs[0].name: tensor})
+    detector.session.run(feeds)
 """
 
 _IMPORT = "import numpy, cv2, pyarrow.parquet, semslam.stages.ingest"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from semslam.geometry.frames import FLU_FROM_OPTICAL, Matrix, rotation_from_vector
 from semslam.geometry.grid import Planes
-from semslam.geometry.projection import extent, flying, main_body, observe, points_in_robot
+from semslam.geometry.projection import extent, flying, main_body, observe, points_in_robot, window
 from semslam.labels import FREE_FLOOR, OBSTACLE, UNOBSERVED
 
 CHAIR, TABLE, CLASSES = 3, 4, 5
@@ -228,3 +228,23 @@ def test_extent_ignores_stray_points() -> None:
     assert span[1].tolist() == [98.0, 0.0, 0.0]
     assert extent(np.full((4, 3), np.nan, np.float32)) is None
     assert extent(np.zeros((0, 3), np.float32)) is None
+
+
+@given(st.integers(1, 120), st.integers(0, 2**32 - 1))
+def test_extent_is_the_quantile_of_numpy(points: int, seed: int) -> None:
+    """To the last bit, for any number of points, in whatever order they lie in memory."""
+    cloud = np.random.default_rng(seed).normal(size=(3, points)).astype(np.float32)
+    expected = np.quantile(cloud.astype(np.float64), (0.02, 0.98), axis=1)
+    for given_points in (cloud.T, np.ascontiguousarray(cloud.T)):
+        span = extent(given_points)
+        assert span is not None
+        assert np.array_equal(span, expected)
+
+
+def test_the_window_of_a_mask() -> None:
+    """The rows and columns of its pixels, and nothing for a mask without any."""
+    mask = np.zeros((6, 8), bool)
+    assert mask[window(mask)].size == 0
+    mask[2, 3] = mask[4, 7] = True
+    assert window(mask) == (slice(2, 5), slice(3, 8))
+    assert window(np.ones((6, 8), bool)) == (slice(0, 6), slice(0, 8))

@@ -108,7 +108,7 @@ def test_inspect_tells_the_operator_set(tmp_path: Path) -> None:
 
 def test_an_error_for_an_unknown_layout_says_how_to_name_one(tmp_path: Path) -> None:
     """Who knows the layout can name it: `--set extract.adapter=NAME`."""
-    path = constant_detector(tmp_path / "m.onnx", {"o": np.zeros((1, 300, 6), np.float32)})
+    path = constant_detector(tmp_path / "m.onnx", {"o": np.zeros((1, 5000, 3), np.float32)})
     with pytest.raises(SemslamError) as caught:
         Detector.open(path)
     assert "extract.adapter" in caught.value.text()

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from semslam.errors import SemslamError
 from semslam.models.segmenters import open_segmenter
-from tests.onnx_factory import sam_decoder, sam_encoder
+from semslam.models.segmenters.sam import SamSegmenter
+from tests.onnx_factory import open_height_encoder, sam_decoder, sam_encoder
 
 PICTURE = np.random.default_rng(1).integers(0, 256, (96, 128, 3), np.uint8)
 DEPTH = np.full((96, 128), 2.0, np.float32)
@@ -121,3 +122,72 @@ def test_without_any_depth_the_box_is_the_mask() -> None:
     for kind in ("depth_box", "box"):
         mask = open_segmenter(kind)(rgb, np.zeros_like(depth), np.array([[98, 58, 222, 182]], np.float32))[0]
         assert np.array_equal(mask, _filled(np.array([98, 58, 222, 182], np.float32), (240, 320)))
+
+
+@pytest.mark.parametrize("count", [1, 3, 40])
+def test_many_boxes_go_in_one_run_where_the_decoder_takes_them(tmp_path: Path, count: int) -> None:
+    """Prompts of open first dimension: a run a 32 boxes, and the masks of one box a run."""
+    encoder = sam_encoder(tmp_path / "e.onnx")
+    many, one = sam_decoder(tmp_path / "m.onnx", many=True), sam_decoder(tmp_path / "o.onnx")
+    rng = np.random.default_rng(2)
+    corners = rng.uniform(0, 60, (count, 2))
+    boxes = np.concatenate([corners, corners + rng.uniform(8, 30, (count, 2))], axis=1).astype(np.float32)
+    together = open_segmenter("sam", str(encoder), str(many))
+    runs = _runs_of_decoder(together)
+    masks = together(PICTURE, DEPTH, boxes)
+    assert len(runs) == -(-count // 32)
+    np.testing.assert_array_equal(masks, open_segmenter("sam", str(encoder), str(one))(PICTURE, DEPTH, boxes))
+
+
+def _runs_of_decoder(segmenter: object) -> list[int]:
+    """Prompts of each run of the decoder from now on."""
+    sizes: list[int] = []
+    session = segmenter.decoder  # type: ignore[attr-defined]
+    inner = session._ort
+
+    class Counting:
+        def run(self, names: object, feeds: dict[str, NDArray[np.float32]]) -> object:
+            sizes.append(len(feeds["point_coords"]))
+            return inner.run(names, feeds)
+
+    object.__setattr__(session, "_ort", Counting())
+    return sizes
+
+
+def test_pixels_of_any_size_go_unpadded_to_an_encoder_that_fills_up_itself(tmp_path: Path) -> None:
+    """samexporter's `--use-preprocess`: an input (height, width, 3) of open size; the picture is 64 x 48 in it."""
+    encoder = open_height_encoder(tmp_path / "e.onnx")
+    seen: list[tuple[int, ...]] = []
+    segmenter = SamSegmenter.open(encoder, sam_decoder(tmp_path / "d.onnx", channels=3, cells=64))
+    inner = segmenter.encoder._ort
+
+    class Noting:
+        def run(self, names: object, feeds: dict[str, NDArray[np.float32]]) -> object:
+            seen.append(feeds["input_image"].shape)
+            return inner.run(names, feeds)
+
+    object.__setattr__(segmenter.encoder, "_ort", Noting())
+    masks = segmenter(PICTURE, DEPTH, BOXES)
+    assert seen == [(768, 1024, 3)]
+    assert all(_share(mask, _filled(box)) > 0.9 for mask, box in zip(masks, BOXES, strict=True))
+
+
+def test_masks_cropped_for_another_picture_do_not_matter(tmp_path: Path) -> None:
+    """Official exports crop `masks` as for the picture they were traced with; `low_res_masks` are right for any."""
+    encoder = sam_encoder(tmp_path / "e.onnx")
+    tall = np.ascontiguousarray(PICTURE.transpose(1, 0, 2))
+    boxes = BOXES[:, [1, 0, 3, 2]].copy()
+    masks = open_segmenter("sam", str(encoder), str(sam_decoder(tmp_path / "d.onnx", frozen=(96, 128))))(
+        tall, DEPTH.T.copy(), boxes
+    )
+    assert all(_share(mask, _filled(box, (128, 96))) > 0.9 for mask, box in zip(masks, boxes, strict=True))
+
+
+@pytest.mark.parametrize("spoilt", [np.nan, np.inf, -np.inf])
+def test_boxes_that_are_no_numbers_give_masks_nonetheless(tmp_path: Path, spoilt: float) -> None:
+    """Of the right shape, and without a traceback."""
+    encoder, decoder = sam_encoder(tmp_path / "e.onnx"), sam_decoder(tmp_path / "d.onnx")
+    boxes = np.array([[spoilt, 0, 20, 20], [10, 10, 40, 40]], np.float32)
+    masks = open_segmenter("sam", str(encoder), str(decoder))(PICTURE, DEPTH, boxes)
+    assert masks.shape == (2, 96, 128)
+    assert _share(masks[1], _filled(boxes[1])) > 0.9

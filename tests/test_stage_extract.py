@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from onnx import helper
 
 from semslam.errors import SemslamError
 from semslam.geometry import rle
 from semslam.geometry.frames import SE2
 from semslam.geometry.grid import to_dense
 from semslam.labels import FIRST_OBJECT, FREE_FLOOR, OBSTACLE, UNOBSERVED
+from semslam.models import builtin
+from semslam.models.builtin import with_shipped
+from semslam.models.detectors import Detections, Detector
+from semslam.models.session import Session
+from semslam.pipeline.config import file_settings, load_config
 from semslam.pipeline.job import Outcome
-from semslam.stages.catalogue import EXTRACT, INGEST
+from semslam.stages.catalogue import EXTRACT, INGEST, STAGES
 from semslam.stages.settings import ExtractConfig, IngestConfig
-from semslam.tables.spec import DETECTIONS, OBSERVATIONS
+from semslam.tables.pictures import decode_colour
+from semslam.tables.spec import DETECTIONS, FRAMES, OBSERVATIONS
 from tests.make_log import ToyTruth, make_log
-from tests.onnx_factory import constant_detector, dense
+from tests.onnx_factory import constant_detector, dense, sam_decoder, sam_encoder, save, value
 from tests.stage_room import Done, run_stage, try_stage
 from tests.toy.render import Renderer, visible_boxes
 from tests.toy.toyroom import CLASSES
@@ -64,7 +72,7 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> tuple[ToyTruth, Done, list[
     return truth, frames, boxes, oracle(folder / "oracle.onnx", boxes)
 
 
-def extract(folder: Path, frames: Done, detector: Path, **settings: Any) -> Done:
+def extract(folder: Path, frames: Done, detector: Path | str, **settings: Any) -> Done:
     return run_stage(folder, EXTRACT, ExtractConfig(detector=str(detector), **settings), inputs=[frames])
 
 
@@ -72,6 +80,24 @@ def refused(folder: Path, frames: Done, **settings: Any) -> Outcome:
     outcome = try_stage(folder, EXTRACT, ExtractConfig(**settings), inputs=[frames])
     assert outcome.failure is not None
     return outcome
+
+
+def picture(frames: Done, index: int) -> np.ndarray:
+    """The colour picture of a keyframe."""
+    return decode_colour(frames.rows(FRAMES)[index]["colour"])
+
+
+def failing_on(monkeypatch: pytest.MonkeyPatch, bad: list[np.ndarray]) -> list[np.ndarray]:
+    """Have every detector fail on these pictures; the list may grow."""
+    real = Detector.look
+
+    def failing(self: Detector, pictures: Any, *rest: Any) -> Any:
+        if any(np.array_equal(one, other) for one in pictures for other in bad):
+            raise SemslamError("the model fails on this picture")
+        return real(self, pictures, *rest)
+
+    monkeypatch.setattr(Detector, "look", failing)
+    return bad
 
 
 def planes_of(done: Done) -> np.ndarray:
@@ -173,21 +199,12 @@ def test_one_bad_keyframe_does_not_stop_a_log(tmp_path: Path, monkeypatch: pytes
     truth = make_log(tmp_path / "toy.mcap", frames=3, size=SIZE)
     frames = run_stage(tmp_path, INGEST, IngestConfig(), sources=[truth.path])
     detector = oracle(tmp_path / "oracle.onnx", first_view_boxes(truth)[:2])
-    from semslam.stages import extract as stage
-
-    real, bad = stage.look, {1}
-
-    def failing(frame: stage.Frame, *rest: Any) -> Any:
-        if frame.row["frame"] in bad:
-            raise SemslamError("the model fails on this picture")
-        return real(frame, *rest)
-
-    monkeypatch.setattr(stage, "look", failing)
+    bad = failing_on(monkeypatch, [picture(frames, 1)])
     done = extract(tmp_path / "one", frames, detector)
     assert [row["frame"] for row in done.rows(OBSERVATIONS)] == [0, 1, 2]
     assert done.manifest["counters"]["frames_failed"] == 1
     assert any("keyframe 1 left out" in warning for warning in done.manifest["warnings"])
-    bad |= {0, 2}
+    bad += [picture(frames, 0), picture(frames, 2)]
     failure = refused(tmp_path / "all", frames, detector=str(detector)).failure
     assert failure is not None
     assert "fails on this picture" in failure.message
@@ -203,8 +220,11 @@ def test_no_objects_is_a_result(toy: tuple[ToyTruth, Done, list[Any], Path], tmp
     assert done.manifest["counters"]["frames_without_objects"] == 1
 
 
-def test_what_is_wrong_is_said(toy: tuple[ToyTruth, Done, list[Any], Path], tmp_path: Path) -> None:
+def test_what_is_wrong_is_said(
+    toy: tuple[ToyTruth, Done, list[Any], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No detector, an even side, an unknown class: one sentence and something to type."""
+    monkeypatch.setattr(builtin, "FOLDER", tmp_path)
     _, frames, _, detector = toy
     none = refused(tmp_path, frames).failure
     assert none is not None
@@ -243,3 +263,157 @@ def test_resumed_extract_gives_the_same_bytes(tmp_path: Path, monkeypatch: pytes
     assert resumed.outcome.resumed == 1
     assert len(looks) == 4 + 3
     assert resumed.digests == whole.digests
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Done, Path]:
+    """Five ingested keyframes, and a detector of open batch size whose boxes move with the brightness of a picture."""
+    folder = tmp_path_factory.mktemp("drive")
+    truth = make_log(folder / "toy.mcap", frames=5, size=SIZE)
+    frames = run_stage(folder, INGEST, IngestConfig(), sources=[truth.path])
+    return frames, moving_detector(folder / "moving.onnx")
+
+
+def moving_detector(path: Path) -> Path:
+    """YOLOv8's layout; its two boxes stand `40 * mean(picture)` pixels further right and lower than written here."""
+    scores = [0.0] * len(CLASSES)
+    rows = {0: [30.0, 40.0, 40.0, 50.0, 0.9, *scores[1:]], 1: [90.0, 60.0, 30.0, 40.0, 0.0, 0.8, *scores[2:]]}
+    weights = {
+        "boxes": dense(84, 4 + len(CLASSES), rows).transpose(0, 2, 1).copy(),
+        "reach": np.array([40.0, 40.0] + [0.0] * (2 + len(CLASSES)), np.float32).reshape(1, -1, 1),
+        "flat": np.array([-1, 1, 1], np.int64),
+    }
+    nodes = [
+        helper.make_node("ReduceMean", ["images"], ["mean"], axes=[1, 2, 3]),
+        helper.make_node("Reshape", ["mean", "flat"], ["brightness"]),
+        helper.make_node("Mul", ["brightness", "reach"], ["shift"]),
+        helper.make_node("Add", ["boxes", "shift"], ["output0"]),
+    ]
+    inputs = [value("images", ("batch", 3, SIZE[1], SIZE[0]))]
+    return save(path, nodes, inputs, [value("output0", ("batch", 4 + len(CLASSES), 84))], weights, metadata=NAMES)
+
+
+def test_results_do_not_depend_on_the_batch(
+    drive: tuple[Done, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Keyframes looked at together give the bytes they give alone, in fewer runs of the detector."""
+    frames, detector = drive
+    real, pictures = Session.run, []
+
+    def counting(session: Session, feeds: Mapping[str, Any]) -> Any:
+        pictures.append(len(feeds["images"]))
+        return real(session, feeds)
+
+    monkeypatch.setattr(Session, "run", counting)
+    alone = extract(tmp_path / "1", frames, detector, batch=1)
+    assert len({row["x0_px"] for row in alone.rows(DETECTIONS)}) == 10
+    pictures.clear()
+    for batch in (2, 4, 9):
+        assert extract(tmp_path / str(batch), frames, detector, batch=batch).digests == alone.digests
+    assert [count for count in pictures if count > 1] == [2, 2, 4, 5]
+    assert extract(tmp_path / "shards", frames, detector, batch=4, shard_frames=3).rows(DETECTIONS) == alone.rows(
+        DETECTIONS
+    )
+
+
+def test_a_bad_keyframe_of_a_batch_fails_alone(
+    drive: tuple[Done, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a run on several pictures fails, the good ones among them are looked at all the same."""
+    frames, detector = drive
+    whole = extract(tmp_path / "whole", frames, detector, batch=3)
+    failing_on(monkeypatch, [picture(frames, 1)])
+    done = extract(tmp_path / "bad", frames, detector, batch=3)
+    assert done.manifest["counters"]["frames_failed"] == 1
+    assert {row["frame"] for row in done.rows(DETECTIONS)} == {0, 2, 3, 4}
+    assert [r for r in whole.rows(OBSERVATIONS) if r["frame"] != 1] == [
+        r for r in done.rows(OBSERVATIONS) if r["frame"] != 1
+    ]
+
+
+def with_masks(monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]) -> None:
+    """Have every detector give masks of this size: for its first object the upper half, for its second a third."""
+    real = Detector.look
+
+    def masked(self: Detector, *args: Any) -> list[Detections]:
+        masks = np.zeros((2, *shape), bool)
+        masks[0, : shape[0] // 2] = masks[1, : shape[0] // 3] = True
+        return [replace(found, masks=masks[: len(found)]) for found in real(self, *args)]
+
+    monkeypatch.setattr(Detector, "look", masked)
+
+
+def test_masks_of_the_detector_are_used_unless_another_way_is_named(
+    drive: tuple[Done, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With segmenter auto a detector that gives masks needs no segmenter; with box, boxes are filled as ever."""
+    frames, detector = drive
+    box = extract(tmp_path / "plain", frames, detector, segmenter="box")
+    with_masks(monkeypatch, (SIZE[1], SIZE[0]))
+    rows = extract(tmp_path / "auto", frames, detector, select=(CLASSES[1],)).rows(DETECTIONS)
+    assert [row["mask_pixels"] for row in rows] == [SIZE[0] * SIZE[1] // 3] * 5
+    assert extract(tmp_path / "box", frames, detector, segmenter="box").digests == box.digests
+
+
+def test_masks_of_another_size_are_no_traceback(
+    drive: tuple[Done, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The message tells both sizes and a way out."""
+    frames, detector = drive
+    with_masks(monkeypatch, (30, 40))
+    failure = refused(tmp_path, frames, detector=str(detector)).failure
+    assert failure is not None
+    assert "masks [2, 30, 40] for 2 objects in a picture [120, 160]" in failure.message
+    assert "extract.segmenter=depth_box" in failure.hint
+
+
+def test_shipped_models_are_used_where_none_are_named(
+    drive: tuple[Done, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a setting extract takes the models of the package; with one, that."""
+    frames, detector = drive
+    monkeypatch.setattr(builtin, "FOLDER", tmp_path)
+    moving_detector(tmp_path / "detector.onnx")
+    assert extract(tmp_path / "a", frames, "").digests == extract(tmp_path / "b", frames, detector).digests
+    pair = sam_encoder(tmp_path / "segmenter_encoder.onnx"), sam_decoder(tmp_path / "segmenter_decoder.onnx")
+    shipped = extract(tmp_path / "c", frames, detector)
+    given = {"segmenter_encoder": str(pair[0]), "segmenter_decoder": str(pair[1])}
+    assert shipped.digests == extract(tmp_path / "d", frames, detector, segmenter="sam", **given).digests
+    plain = extract(tmp_path / "e", frames, detector, segmenter="depth_box")
+    assert shipped.digests != plain.digests
+
+
+def test_the_cache_key_holds_the_shipped_models_that_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A task names every shipped file it may use, and no other; what a user names stays."""
+    monkeypatch.setattr(builtin, "FOLDER", tmp_path)
+
+    def named(*assignments: str) -> dict[str, str]:
+        config = load_config(STAGES, assignments=assignments)
+        return {key: Path(path).name for key, path in file_settings(config.for_variant(EXTRACT, ""), "extract")}
+
+    assert named() == {}
+    for name in ("detector", "segmenter_encoder", "segmenter_decoder"):
+        (tmp_path / f"{name}.onnx").write_bytes(b"")
+    keys = ("extract.detector", "extract.segmenter_encoder", "extract.segmenter_decoder")
+    every = {key: f"{key.removeprefix('extract.')}.onnx" for key in keys}
+    assert named() == named("extract.segmenter=sam") == every
+    assert named("extract.segmenter=box") == {"extract.detector": "detector.onnx"}
+    assert named("extract.detector=mine.onnx") == every | {"extract.detector": "mine.onnx"}
+    half = named("extract.segmenter_encoder=mine.onnx")
+    assert half == {"extract.detector": "detector.onnx", "extract.segmenter_encoder": "mine.onnx"}
+    assert with_shipped(with_shipped(ExtractConfig())) == with_shipped(ExtractConfig())
+
+
+def test_looking_ahead_changes_nothing() -> None:
+    """Groups come in their order, and what goes wrong in making one is said when its turn comes."""
+    from semslam.stages.extract import ahead
+
+    def groups() -> Iterator[list[Any]]:
+        yield from ([1], [2, 3])
+        raise SemslamError("Stored picture cannot be decoded")
+
+    got: list[Any] = []
+    with pytest.raises(SemslamError, match="cannot be decoded"):
+        got.extend(ahead(groups()))
+    assert got == [[1], [2, 3]]
+    assert list(ahead(iter([]))) == []

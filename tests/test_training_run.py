@@ -21,8 +21,8 @@ from semslam.errors import SemslamError  # noqa: E402
 from semslam.models.detectors import Detector as OpenDetector  # noqa: E402
 from semslam.models.nets.detector import Detector, DetectorShape, Exported, cells  # noqa: E402
 from semslam.models.training.detector import Batches, Examples, assign, generalised_iou, size_at  # noqa: E402
-from semslam.models.training.pictures import PictureSet  # noqa: E402
-from semslam.models.training.runs import CLASSES, asked, new_detector, train_detector, trained_detector  # noqa: E402
+from semslam.models.training.pictures import CLASSES, PictureSet  # noqa: E402
+from semslam.models.training.runs import TASKS, asked, new_detector, train_detector, trained_detector  # noqa: E402
 from semslam.models.training.trainer import CHECKPOINT, Schedule, fit, read_checkpoint  # noqa: E402
 from tests.views_factory import NAMES, write_views  # noqa: E402
 
@@ -204,3 +204,27 @@ def test_the_network_is_small() -> None:
     assert 0.5e6 < sum(value.numel() for value in network.parameters()) < 1.05e6
     raw = Detector(DetectorShape(3))(torch.rand(1, 3, 240, 320), torch.rand(1, 1, 240, 320))
     assert raw.shape == (1, 7, len(cells(320, 240)[0]))
+
+
+def test_a_finished_run_leaves_a_card_with_what_it_is_worth(tmp_path: Path) -> None:
+    """Data, seed, command, digest and average precision on views given for it."""
+    import hashlib
+
+    views = write_views(tmp_path / "views")
+    pytest.importorskip("pycocotools", reason="needs the extra [train]")
+    model, card = train_detector(small_run(views, tmp_path / "run", test=views))
+    text = card.read_text()
+    assert hashlib.sha256(model.read_bytes()).hexdigest() in text
+    assert f"--steps {STEPS} --batch 2" in text
+    assert "| **all** |" in text
+    assert "| seed | 1 |" in text
+
+
+@pytest.mark.parametrize("task", ["detector", "segmenter"])
+def test_random_networks_are_exported_by_seed(task: str, tmp_path: Path) -> None:
+    """`models export --random`: the same seed gives the same files, another one others."""
+    one, two, three = (
+        TASKS[task].export(tmp_path / name, None, seed, None) for name, seed in zip("abc", (1, 1, 2), strict=True)
+    )
+    assert [path.read_bytes() for path in one] == [path.read_bytes() for path in two]
+    assert [path.read_bytes() for path in one] != [path.read_bytes() for path in three]

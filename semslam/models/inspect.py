@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from semslam.models.class_names import names_from_metadata
-from semslam.models.detectors import matching, with_known_sizes
+from semslam.models.detectors import grouped, matching, with_known_sizes
 from semslam.models.onnxfile import file_digest
 from semslam.models.session import Signature, open_session
 
@@ -28,7 +28,7 @@ class ModelDescription:
     adapter: str
     """Name of the detector adapter that fits; empty if none does."""
     classes: int | None
-    """Number of classes the adapter reads from the outputs."""
+    """Number of classes the adapter reads from the outputs; None if they do not tell."""
     class_names: tuple[str, ...]
     """As the metadata has them; empty if it has none."""
     reasons: Mapping[str, str]
@@ -43,7 +43,8 @@ class ModelDescription:
         lines = [f"{self.path}   {self.bytes:,} bytes, sha256 {self.sha256[:16]}...", self.signature.text()]
         lines += [f"  {self.opset}, producer {self.producer or '-'}, runs on {self.provider}", ""]
         if self.adapter:
-            lines.append(f"detector: adapter {self.adapter}, {self.classes} classes")
+            count = "any number of" if self.classes is None else self.classes
+            lines.append(f"detector: adapter {self.adapter}, {count} classes")
             lines.append(
                 f"class names: {', '.join(self.class_names)}" if self.class_names else "class names: none in it"
             )
@@ -51,7 +52,7 @@ class ModelDescription:
                 lines.append("hint: give them with `--classes FILE.txt`")
         else:
             lines.append("detector: no adapter fits")
-        lines += [f"  not {name}: {reason}" for name, reason in self.reasons.items()]
+        lines += [f"  not {line.strip()}" for line in grouped(self.reasons)]
         return "\n".join(lines)
 
 
@@ -64,6 +65,7 @@ def describe(path: Path) -> ModelDescription:
     session = open_session(path)
     signature = with_known_sizes(session)
     adapter, reasons = matching(signature)
+    counts = adapter.classes(signature) if adapter else ()
     return ModelDescription(
         path=str(path),
         sha256=file_digest(path),
@@ -73,7 +75,7 @@ def describe(path: Path) -> ModelDescription:
         provider=session.provider,
         signature=session.signature,
         adapter=adapter.name if adapter else "",
-        classes=adapter.classes(signature) if adapter else None,
+        classes=counts[0] if counts else None,
         class_names=tuple(names_from_metadata(session.signature.metadata) or ()),
         reasons=reasons,
     )

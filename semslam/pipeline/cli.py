@@ -609,6 +609,7 @@ def _training_options(command: _Command) -> _Command:
         (
             click.argument("views", type=click.Path(path_type=Path)),
             click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run."),
+            click.option("--test", type=click.Path(path_type=Path), help="Views of other homes, to judge the result."),
             click.option("--steps", type=click.IntRange(1), help="Default: as the shipped model."),
             click.option("--batch", type=click.IntRange(1), help="Pictures a step. Default: as the shipped model."),
             click.option("--rate", type=float, help="Peak learning rate. Default: as the shipped model."),

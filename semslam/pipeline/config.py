@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from semslam.errors import UsageError
+from semslam.models.builtin import with_shipped
 from semslam.pipeline.files import canonical_json
 from semslam.stages.contract import Stage
 from semslam.stages.settings import ExtractConfig
@@ -41,8 +42,11 @@ class Config:
         return tuple(getattr(self.of(stage), stage.variants)) if stage.variants else ("",)
 
     def for_variant(self, stage: Stage, variant: str) -> Any:
-        """The configuration of one task of the stage."""
-        return self.of(stage).for_variant(variant) if stage.variants else self.of(stage)
+        """The configuration of one task of the stage, with the shipped models that it may use named."""
+        section = self.of(stage)
+        if isinstance(section, ExtractConfig):
+            return with_shipped(section)
+        return section.for_variant(variant) if stage.variants else section
 
     def as_json(self) -> dict[str, Any]:
         """Plain values, with paths as they are."""

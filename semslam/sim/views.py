@@ -125,7 +125,7 @@ def file_of(folder: Path, home_seed: int) -> Path:
 
 def _agree(out: Path, recipe: ViewRecipe) -> None:
     """Write the plan, or see that the one that is there is the same but for the number of homes."""
-    plan = {"format": "semslam views", "recipe": asdict(recipe), "versions": versions()}
+    plan: dict[str, Any] = {"format": "semslam views", "recipe": asdict(recipe), "versions": versions()}
     path = out / _PLAN
     if path.is_file():
         stored = json.loads(path.read_text())
@@ -243,7 +243,7 @@ def _spots(home: Home) -> Array:
 
     free, origin = free_raster(home)
     far = cv2.distanceTransform(free.astype(np.uint8), cv2.DIST_L2, 5) * _RASTER_M > _CLEARANCE_M
-    return np.argwhere(far)[:, ::-1] * _RASTER_M + np.asarray(origin) + _RASTER_M / 2
+    return np.asarray(np.argwhere(far)[:, ::-1] * _RASTER_M + np.asarray(origin) + _RASTER_M / 2, np.float64)
 
 
 def _pose(rng: np.random.Generator, spots: Array, height_m: float, pitch_rad: float) -> Array:

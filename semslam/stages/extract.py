@@ -8,10 +8,12 @@ Paper   section III-A, equation 1
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,16 +21,25 @@ from numpy.typing import NDArray
 from semslam.errors import SemslamError
 from semslam.geometry import rle
 from semslam.geometry.grid import to_sparse
-from semslam.geometry.projection import extent, observe, points_in_robot
+from semslam.geometry.projection import Landing, extent, land, observe_landed, points_in_robot, window
 from semslam.labels import FIRST_OBJECT, RESERVED, UNOBSERVED, class_list
-from semslam.models.detectors import Detector
+from semslam.models.builtin import with_shipped
+from semslam.models.detectors import Detections, Detector
 from semslam.models.segmenters import Segmenter, open_segmenter
 from semslam.stages.contract import ShardWriter, StageContext, row_shards
 from semslam.stages.settings import ExtractConfig
 from semslam.tables.pictures import decode_colour, decode_depth
-from semslam.tables.spec import DETECTIONS, FRAMES, OBSERVATIONS, Table
+from semslam.tables.spec import DETECTIONS, FRAMES, OBSERVATIONS
 
 Row = dict[str, Any]
+Columns = dict[str, Any]
+"""Equally long columns of a table."""
+T = TypeVar("T")
+
+_ROWS_READ = 8
+"""Keyframes read at once; what lies in a table is small beside decoded pictures."""
+_KEPT_BYTES = 24 << 20
+"""Larger than any array of a keyframe, and below the 32 MiB up to which glibc learns."""
 
 
 def run(ctx: StageContext) -> None:
@@ -38,34 +49,18 @@ def run(ctx: StageContext) -> None:
         SemslamError: no detector, an unsuitable model, a class list that does not fit, an even side.
     """
     config: ExtractConfig = ctx.config
-    detector, segmenter = open_models(config, ctx.threads)
-    classes = ObjectClasses.choose(detector.class_names, config)
+    eyes = Eyes.open(config, ctx.threads)
     frames = ctx.read(FRAMES)
-    meta = {"classes": classes.all, "cell_m": config.cell_m, "side": config.side}
+    keep_freed_memory()
     for index, start, stop in row_shards(frames.rows, config.shard_frames):
         if index < len(ctx.finished):
             continue
+        groups = ahead(_groups(_rows(frames.batches(None, start, stop, _ROWS_READ)), config))
+        recognised = chain.from_iterable(ahead(_recognised(groups, eyes)))
         with ctx.shard(index) as shard:
-            shard.remark(f"detector read as {detector.name}, {len(classes.of_detector)} classes, {detector.provider}")
-            shard.note("provider", detector.provider)
-            detections = shard.table(DETECTIONS, {"classes": classes.all})
-            observations = shard.table(OBSERVATIONS, meta)
-            failures: list[SemslamError] = []
-            for done, frame in enumerate(_frames(frames.batches(None, start, stop, 4), config), start + 1):
-                try:
-                    seen = look(frame, detector, segmenter, classes, config)
-                except SemslamError as error:
-                    failures.append(error)
-                    shard.warn(f"keyframe {frame.row['frame']} left out: {error.message}")
-                    seen = blind(frame, config)
-                detections.append(_columns(DETECTIONS, seen.detections))
-                observations.append(_columns(OBSERVATIONS, [seen.observation]))
-                _count(shard, seen)
-                ctx.progress(done, frames.rows)
-            if failures:
-                shard.count("frames_failed", len(failures))
-                if len(failures) == stop - start:
-                    raise failures[0]  # not a bad frame, but a model that does not fit
+            failures = _fill(shard, _counted(recognised, ctx, start, frames.rows), eyes)
+            if failures and len(failures) == stop - start:
+                raise failures[0]  # not a bad frame, but a model that does not fit
 
 
 @dataclass(frozen=True)
@@ -107,6 +102,22 @@ class ObjectClasses:
 
 
 @dataclass(frozen=True)
+class Eyes:
+    """All that looks at keyframes, as a configuration wants it."""
+
+    detector: Detector
+    segmenter: Segmenter
+    classes: ObjectClasses
+    config: ExtractConfig
+
+    @staticmethod
+    def open(config: ExtractConfig, threads: int) -> Eyes:
+        """Open the models and choose the classes."""
+        detector, segmenter = open_models(config, threads)
+        return Eyes(detector, segmenter, ObjectClasses.choose(detector.class_names, config), config)
+
+
+@dataclass(frozen=True)
 class Frame:
     """A keyframe ready for use."""
 
@@ -115,20 +126,41 @@ class Frame:
     """(H, W, 3)"""
     depth_m: NDArray[np.float32]
     """(H, W), 0 where missing or out of range."""
+    landing: Landing
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the models found in a keyframe, of the classes that are kept."""
+
+    boxes: NDArray[np.float32]
+    """(N, 4)"""
+    scores: NDArray[np.float32]
+    """(N,)"""
+    source_ids: NDArray[np.int64]
+    """(N,) classes of the detector."""
+    masks: NDArray[np.bool_]
+    """(N, H, W)"""
+    dropped: int
+    """Boxes that the detector gave with impossible values."""
+
+
+Recognised = list[tuple[Frame, Found | SemslamError]]
+"""A group of keyframes, each with what the models found in it, or why they failed."""
 
 
 @dataclass(frozen=True)
 class Seen:
     """What one keyframe showed."""
 
-    detections: list[Row]
-    observation: Row
+    detections: Columns
+    observation: Columns
     dropped: int
-    """Boxes that the detector gave with impossible values."""
 
 
 def open_models(config: ExtractConfig, threads: int) -> tuple[Detector, Segmenter]:
     """Detector and segmenter of a configuration."""
+    config = with_shipped(config)
     if not config.detector:
         raise SemslamError(
             "No detector: extract needs an ONNX model that finds objects",
@@ -148,134 +180,210 @@ def open_models(config: ExtractConfig, threads: int) -> tuple[Detector, Segmente
     return detector, open_segmenter(config.segmenter, config.segmenter_encoder, config.segmenter_decoder, threads)
 
 
-def look(frame: Frame, detector: Detector, segmenter: Segmenter, classes: ObjectClasses, config: ExtractConfig) -> Seen:
-    """One keyframe through equation 1."""
-    found = detector(frame.rgb, config.min_score, config.max_overlap)
-    kept = [i for i, class_id in enumerate(found.class_ids) if int(class_id) in classes.of_detector]
-    class_ids = np.array([classes.of_detector[int(found.class_ids[i])] for i in kept], np.int64)
-    masks = segmenter(frame.rgb, frame.depth_m, found.boxes[kept])  # (N, H, W)
-    points = points_in_robot(
-        frame.depth_m,
-        frame.row["fx"],
-        frame.row["fy"],
-        frame.row["cx"],
-        frame.row["cy"],
-        np.array(frame.row["robot_from_camera"]).reshape(4, 4),
-    )
-    planes = observe(
-        masks,
-        class_ids,
-        points,
-        frame.depth_m > 0,
-        len(classes.all),
-        cell_m=config.cell_m,
-        side=config.side,
-        floor_tolerance_m=config.floor_tolerance_m,
-        max_height_m=config.max_height_m,
-        min_pixels=config.min_pixels,
-    )
-    cells, weights = to_sparse(planes)
-    rows = [
-        _detection_row(
-            frame,
-            index,
-            box=found.boxes[i],
-            score=found.scores[i],
-            class_id=int(class_ids[index]),
-            source_label=detector.class_names[int(found.class_ids[i])],
-            label=classes.all[int(class_ids[index])],
-            mask=masks[index],
-            points=points,
+def _fill(
+    shard: ShardWriter, recognised: Iterable[tuple[Frame, Found | SemslamError]], eyes: Eyes
+) -> list[SemslamError]:
+    """Write what keyframes show into a shard; returns why some could not be looked at."""
+    detector, classes, config = eyes.detector, eyes.classes, eyes.config
+    shard.remark(f"detector read as {detector.name}, {len(classes.of_detector)} classes, {detector.provider}")
+    shard.note("provider", detector.provider)
+    detections = shard.table(DETECTIONS, {"classes": classes.all})
+    meta = {"classes": classes.all, "cell_m": config.cell_m, "side": config.side}
+    observations = shard.table(OBSERVATIONS, meta)
+    failures: list[SemslamError] = []
+    for frame, found in recognised:
+        if isinstance(found, SemslamError):
+            failures.append(found)
+            shard.count("frames_failed")
+            shard.warn(f"keyframe {frame.row['frame']} left out: {found.message}")
+        seen = blind(frame, config) if isinstance(found, SemslamError) else look(frame, found, eyes)
+        detections.append(seen.detections)
+        observations.append(seen.observation)
+        _count(shard, seen)
+    return failures
+
+
+def _counted(items: Iterable[T], ctx: StageContext, start: int, total: int) -> Iterator[T]:
+    """The items; progress is told when the next one is asked for."""
+    for done, item in enumerate(items, start + 1):
+        yield item
+        ctx.progress(done, total)
+
+
+def _recognised(groups: Iterator[list[Frame]], eyes: Eyes) -> Iterator[Recognised]:
+    """Groups of keyframes through the models."""
+    for group in groups:
+        yield [(frame, _masked(frame, found, eyes)) for frame, found in zip(group, find(group, eyes), strict=True)]
+
+
+def find(group: Sequence[Frame], eyes: Eyes) -> list[Detections | SemslamError]:
+    """What the detector finds in each keyframe; where it fails on several at once, each is tried alone."""
+    config = eyes.config
+    pictures, depths_m = [frame.rgb for frame in group], [frame.depth_m for frame in group]
+    try:
+        return [*eyes.detector.look(pictures, depths_m, config.min_score, config.max_overlap)]
+    except SemslamError as error:
+        return [error] if len(group) == 1 else [one for frame in group for one in find([frame], eyes)]
+
+
+def _masked(frame: Frame, found: Detections | SemslamError, eyes: Eyes) -> Found | SemslamError:
+    """The detections of classes that are kept, with their pixels."""
+    if isinstance(found, SemslamError):
+        return found
+    kept = [i for i, class_id in enumerate(found.class_ids.tolist()) if class_id in eyes.classes.of_detector]
+    try:
+        masks = _masks(frame, found, kept, eyes)
+    except SemslamError as error:
+        return error
+    return Found(found.boxes[kept], found.scores[kept], found.class_ids[kept], masks, found.dropped)
+
+
+def _masks(frame: Frame, found: Detections, kept: Sequence[int], eyes: Eyes) -> NDArray[np.bool_]:
+    """Masks (N, H, W) of the detections kept: the detector's own, if they are wanted and there, else the segmenter's.
+
+    Raises:
+        SemslamError: they have another size than the picture, or the segmenter fails.
+    """
+    if eyes.config.segmenter == "auto" and found.masks is not None:
+        masks, by = found.masks[kept], "detector"
+    else:
+        masks, by = eyes.segmenter(frame.rgb, frame.depth_m, found.boxes[kept]), "segmenter"
+    if masks.shape != (len(kept), *frame.depth_m.shape):
+        raise SemslamError(
+            f"The {by} gives masks {list(masks.shape)} for {len(kept)} objects in a picture "
+            f"{list(frame.depth_m.shape)}",
+            hint="choose another way to masks: `--set extract.segmenter=depth_box`",
         )
-        for index, i in enumerate(kept)
-    ]
-    observation = {
-        "frame": frame.row["frame"],
-        "stamp_nanos": frame.row["stamp_nanos"],
-        "cells": cells,
-        "weights": weights,
-        "objects": sum(row["depth_pixels"] > 0 for row in rows),
+    return masks
+
+
+def look(frame: Frame, found: Found, eyes: Eyes) -> Seen:
+    """One keyframe through equation 1."""
+    classes, names = eyes.classes, eyes.detector.class_names
+    class_ids = np.array([classes.of_detector[i] for i in found.source_ids.tolist()], np.int64)
+    planes = observe_landed(found.masks, class_ids, frame.landing, len(classes.all), eyes.config.min_pixels)
+    cells, weights = to_sparse(planes)
+    rows = {
+        **_who(frame, len(class_ids)),
+        "class_id": class_ids,
+        "label": [classes.all[i] for i in class_ids.tolist()],
+        "source_label": [names[i] for i in found.source_ids.tolist()],
+        "score": found.scores,
+        **dict(zip(("x0_px", "y0_px", "x1_px", "y1_px"), found.boxes.T, strict=True)),
+        **_shapes(frame, found.masks),
     }
-    return Seen(rows, observation, found.dropped)
+    objects = sum(pixels > 0 for pixels in rows["depth_pixels"])
+    return Seen(rows, _observation(frame, cells, weights, objects), found.dropped)
 
 
 def blind(frame: Frame, config: ExtractConfig) -> Seen:
     """What a keyframe tells that could not be looked at: nothing, everywhere."""
     cells = np.arange(config.side**2, dtype=np.uint32) + UNOBSERVED * config.side**2
-    observation = {
-        "frame": frame.row["frame"],
-        "stamp_nanos": frame.row["stamp_nanos"],
-        "cells": cells,
-        "weights": np.ones(cells.size, np.float32),
-        "objects": 0,
-    }
-    return Seen([], observation, 0)
+    nothing: Columns = {column.name: [] for column in DETECTIONS.columns}
+    return Seen(nothing, _observation(frame, cells, np.ones(cells.size, np.float32), 0), 0)
 
 
-def _detection_row(
-    frame: Frame,
-    index: int,
-    *,
-    box: NDArray[np.float32],
-    score: float,
-    class_id: int,
-    source_label: str,
-    label: str,
-    mask: NDArray[np.bool_],
-    points: NDArray[np.float32],
-) -> Row:
-    """One row of the detections table."""
-    window = _window(mask)
-    usable = mask[window] & (frame.depth_m[window] > 0)
-    span = extent(points[window][usable])
+def _who(frame: Frame, count: int) -> Columns:
+    """The columns that name `count` detections of a keyframe."""
     return {
-        "frame": frame.row["frame"],
-        "stamp_nanos": frame.row["stamp_nanos"],
-        "detection": index,
-        "class_id": class_id,
-        "label": label,
-        "source_label": source_label,
-        "score": float(score),
-        "x0_px": float(box[0]),
-        "y0_px": float(box[1]),
-        "x1_px": float(box[2]),
-        "y1_px": float(box[3]),
-        "mask_runs": rle.encode(mask),
-        "mask_pixels": int(mask.sum()),
-        "depth_pixels": int(usable.sum()),
-        **{f"min_{axis}_m": None if span is None else float(span[0][i]) for i, axis in enumerate("xyz")},
-        **{f"max_{axis}_m": None if span is None else float(span[1][i]) for i, axis in enumerate("xyz")},
+        "frame": [frame.row["frame"]] * count,
+        "stamp_nanos": [frame.row["stamp_nanos"]] * count,
+        "detection": list(range(count)),
     }
 
 
-def _window(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """The smallest rectangle of rows and columns that holds a mask; empty for an empty one."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if rows.size == 0:
-        return slice(0, 0), slice(0, 0)
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+def _shapes(frame: Frame, masks: NDArray[np.bool_]) -> Columns:
+    """The columns that tell the pixels and the 3D extent of every mask."""
+    runs = [rle.encode(mask) for mask in masks]
+    usable = [_usable_points(frame, mask) for mask in masks]
+    spans = [extent(points) for points in usable]
+    return {
+        "mask_runs": runs,
+        "mask_pixels": [int(one[1::2].sum()) for one in runs],
+        "depth_pixels": [len(points) for points in usable],
+        **{f"min_{axis}_m": [span and float(span[0][i]) for span in spans] for i, axis in enumerate("xyz")},
+        **{f"max_{axis}_m": [span and float(span[1][i]) for span in spans] for i, axis in enumerate("xyz")},
+    }
 
 
-def _frames(batches: Iterator[dict[str, list[Any]]], config: ExtractConfig) -> Iterator[Frame]:
-    """Decode the pictures of keyframes; depth out of range counts as missing."""
+def _usable_points(frame: Frame, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Points (n, 3) of the pixels of a mask that have depth."""
+    near = window(mask)
+    usable = mask[near] & (frame.depth_m[near] > 0)
+    return np.stack([axis[usable] for axis in np.moveaxis(frame.landing.points[near], -1, 0)]).T
+
+
+def _observation(frame: Frame, cells: NDArray[np.uint32], weights: NDArray[np.float32], objects: int) -> Columns:
+    """The row of a keyframe in the observations table."""
+    row = frame.row
+    return {
+        "frame": [row["frame"]],
+        "stamp_nanos": [row["stamp_nanos"]],
+        "cells": [cells],
+        "weights": [weights],
+        "objects": [objects],
+    }
+
+
+def ahead(items: Iterator[T]) -> Iterator[T]:
+    """The same items in the same order, the next one made in a thread while this one is used.
+
+    OpenCV, numpy and ONNX Runtime let go of Python's lock meanwhile, so what is not the models' work hides behind it
+    where a processor is free.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        coming: Future[T | None] = pool.submit(next, items, None)
+        while (item := coming.result()) is not None:
+            coming = pool.submit(next, items, None)
+            yield item
+
+
+def keep_freed_memory() -> None:
+    """Have the allocator keep what one keyframe frees for the next.
+
+    glibc returns blocks of a picture's size to the system at once, until one as large has been freed; to have them
+    anew, page by page, took a third of a keyframe's time outside the models. Elsewhere this does nothing.
+    """
+    np.empty(_KEPT_BYTES, np.uint8)
+
+
+def _rows(batches: Iterator[dict[str, list[Any]]]) -> Iterator[Row]:
+    """The rows of batches of columns."""
     for batch in batches:
-        for index in range(len(batch["frame"])):
-            row = {name: values[index] for name, values in batch.items()}
-            rgb, depth_m = decode_colour(row.pop("colour")), decode_depth(row.pop("depth"))
-            depth_m[(depth_m < config.min_depth_m) | (depth_m > config.max_depth_m)] = 0.0
-            yield Frame(row, rgb, depth_m)
+        for values in zip(*batch.values(), strict=True):
+            yield dict(zip(batch, values, strict=True))
 
 
-def _columns(table: Table, rows: Sequence[Row]) -> dict[str, list[Any]]:
-    return {column.name: [row[column.name] for row in rows] for column in table.columns}
+def _groups(rows: Iterator[Row], config: ExtractConfig) -> Iterator[list[Frame]]:
+    """Keyframes in groups that the detector sees at once."""
+    while group := [_frame(row, config) for row in islice(rows, config.batch)]:
+        yield group
+
+
+def _frame(row: Row, config: ExtractConfig) -> Frame:
+    """A keyframe with its pictures decoded and its pixels on the ground; depth out of range counts as missing."""
+    rgb, depth_m = decode_colour(row.pop("colour")), decode_depth(row.pop("depth"))
+    depth_m *= (depth_m >= config.min_depth_m) & (depth_m <= config.max_depth_m)
+    robot_from_camera = np.array(row["robot_from_camera"]).reshape(4, 4)
+    points = points_in_robot(depth_m, row["fx"], row["fy"], row["cx"], row["cy"], robot_from_camera)
+    landing = land(
+        points,
+        depth_m > 0,
+        cell_m=config.cell_m,
+        side=config.side,
+        floor_tolerance_m=config.floor_tolerance_m,
+        max_height_m=config.max_height_m,
+    )
+    return Frame(row, rgb, depth_m, landing)
 
 
 def _count(shard: ShardWriter, seen: Seen) -> None:
-    shard.count("detections", len(seen.detections))
-    shard.count("detections_without_depth", len(seen.detections) - seen.observation["objects"])
+    detections = len(seen.detections["frame"])
+    shard.count("detections", detections)
+    shard.count("detections_without_depth", detections - seen.observation["objects"][0])
     if seen.dropped:
         shard.count("boxes_impossible", seen.dropped)
-    if not seen.detections:
+    if not detections:
         shard.count("frames_without_objects")
 
 

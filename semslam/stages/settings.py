@@ -68,15 +68,16 @@ class ExtractConfig:
     """From keyframes to detections and observation maps (equation 1)."""
 
     detector: str = setting("", file=True)
-    """ONNX file of the detector."""
+    """ONNX file of the detector; empty takes the shipped one."""
     adapter: str = setting("auto")
     """Layout of the detector's inputs and outputs; auto recognises it (`semslam models inspect FILE.onnx`)."""
     classes: str = setting("", file=True)
     """Text file with the detector's class names, one a line; empty takes them from the model's metadata."""
     segmenter: str = setting("auto", choices=("auto", "sam", "depth_box", "box"))
-    """How a box becomes a mask; auto is sam if its two files are given, else depth_box (GrabCut seeded by depth)."""
+    """How a box becomes a mask; auto takes the masks of the detector if it gives any, else those of the encoder and
+    decoder below, else depth_box (GrabCut seeded by depth)."""
     segmenter_encoder: str = setting("", file=True)
-    """ONNX file of the segmenter's image encoder."""
+    """ONNX file of the segmenter's image encoder; empty, like the decoder, takes the shipped one."""
     segmenter_decoder: str = setting("", file=True)
     """ONNX file of the segmenter's box-prompted mask decoder."""
     min_score: float = setting(0.3, low=0.0, high=1.0)
@@ -105,6 +106,9 @@ class ExtractConfig:
     """Floor or obstacle pixels that a cell needs before it counts as seen."""
     shard_frames: int = setting(100, low=1, high=100000)
     """Keyframes a shard: what a killed run loses at most."""
+    batch: int = setting(1, low=1, high=16)
+    """Keyframes that the detector sees at once, if its file leaves the batch size open. No result depends on it. More
+    than one gains nothing on a processor, only on a GPU, and each costs about 40 MB at 640 x 480."""
 
 
 @dataclass(frozen=True)

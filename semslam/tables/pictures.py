@@ -23,9 +23,7 @@ def encode_colour(rgb: NDArray[np.uint8]) -> bytes:
 
 def decode_colour(data: bytes) -> NDArray[np.uint8]:
     """(H, W, 3) RGB of a JPEG or PNG file, as its pixels lie: what EXIF says of its orientation does not count."""
-    return np.asarray(
-        cv2.cvtColor(_decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION), cv2.COLOR_BGR2RGB), np.uint8
-    )
+    return _decode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
 def encode_depth(depth_m: NDArray[np.float32]) -> bytes:

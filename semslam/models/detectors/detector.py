@@ -2,49 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semslam.errors import SemslamError
 from semslam.models.class_names import names_from_file, names_from_metadata
-from semslam.models.detections import Detections, Floats, Letterbox
-from semslam.models.detectors.layout import Array, input_size, one_picture
-from semslam.models.detectors.nanodet import Nanodet
-from semslam.models.detectors.yolov5 import Yolov5
-from semslam.models.detectors.yolov8 import Yolov8
-from semslam.models.detectors.yolox import Yolox
+from semslam.models.detections import Detections, Floats
+from semslam.models.detectors.adapter import Adapter, Array, Look
+from semslam.models.detectors.layout import blank_feeds
+from semslam.models.detectors.table import ADAPTERS
 from semslam.models.session import Session, Signature, open_session
-
-
-class Adapter(Protocol):
-    """How to feed a layout of detector and how to read it."""
-
-    @property
-    def name(self) -> str:
-        """As `extract.adapter` calls it."""
-
-    def mismatch(self, signature: Signature) -> str:
-        """Why a model is not of this layout; empty if it is."""
-
-    def preprocess(self, rgb: NDArray[np.uint8], signature: Signature) -> tuple[Floats, Letterbox]:
-        """The model's input for a picture (H, W, 3)."""
-
-    def postprocess(
-        self, outputs: list[Array], box: Letterbox, signature: Signature, min_score: float, max_overlap: float, /
-    ) -> Detections:
-        """Detections in pixels of the picture."""
-
-    def classes(self, signature: Signature) -> int:
-        """Number of classes of a model that fits."""
-
-
-ADAPTERS: tuple[Adapter, ...] = (Yolox(), Yolox("yolox_decoded", decoded=True), Nanodet(), Yolov5(), Yolov8())
-"""All layouts, tried in this order."""
 
 
 @dataclass(frozen=True)
@@ -86,21 +57,70 @@ class Detector:
         """Execution provider that runs it."""
         return self.session.provider
 
-    def __call__(self, rgb: NDArray[np.uint8], min_score: float, max_overlap: float) -> Detections:
-        """Objects in a picture (H, W, 3) RGB."""
-        tensor, box = self.adapter.preprocess(rgb, self.signature)
-        outputs = self.session.run({self.signature.inputs[0].name: tensor})
-        return self.adapter.postprocess(outputs, box, self.signature, min_score, max_overlap)
+    def __call__(
+        self, rgb: NDArray[np.uint8], min_score: float, max_overlap: float, depth_m: Floats | None = None
+    ) -> Detections:
+        """Objects in a picture (H, W, 3) RGB with depth (H, W) in metres, 0 where missing, for models that use it."""
+        prepared = self._prepare(rgb, depth_m, min_score, max_overlap)
+        return self._read(self.session.run(prepared.feeds), prepared.look)
+
+    def look(
+        self, pictures: Sequence[NDArray[np.uint8]], depths_m: Sequence[Floats], min_score: float, max_overlap: float
+    ) -> list[Detections]:
+        """Objects in each of many pictures: all in one run if the model's batch size is open, else one by one."""
+        pairs = zip(pictures, depths_m, strict=True)
+        prepared = [self._prepare(rgb, depth_m, min_score, max_overlap) for rgb, depth_m in pairs]
+        outputs = self._run_together(prepared) or [self.session.run(one.feeds) for one in prepared]
+        return [self._read(answer, one.look) for answer, one in zip(outputs, prepared, strict=True)]
+
+    def _prepare(
+        self, rgb: NDArray[np.uint8], depth_m: Floats | None, min_score: float, max_overlap: float
+    ) -> _Prepared:
+        feeds, box = self.adapter.preprocess(rgb, depth_m, self.signature)
+        return _Prepared(feeds, Look(box, min_score, max_overlap, self.class_names, depth_m))
+
+    def _read(self, outputs: list[Array], look: Look) -> Detections:
+        return self.adapter.postprocess(outputs, look, self.signature).of_classes(len(self.class_names))
+
+    def _run_together(self, prepared: Sequence[_Prepared]) -> list[list[Array]] | None:
+        """The outputs for each picture from one run; None if the model cannot, or does not give one answer each."""
+        signature = self.session.signature
+        if len(prepared) < 2 or not _open_batch(signature):
+            return None
+        try:
+            joined = {t.name: np.concatenate([one.feeds[t.name] for one in prepared]) for t in signature.inputs}
+            outputs = self.session.run(joined)
+        except (SemslamError, ValueError):  # its graph does not keep what its inputs promise
+            return None
+        if any(len(output) != len(prepared) for output in outputs):
+            return None
+        return [[output[i : i + 1] for output in outputs] for i in range(len(prepared))]
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    feeds: Mapping[str, Array]
+    look: Look
+
+
+def _open_batch(signature: Signature) -> bool:
+    tensors = (*signature.inputs, *signature.outputs)
+    return all(tensor.shape and isinstance(tensor.shape[0], str) for tensor in tensors)
 
 
 def with_known_sizes(session: Session) -> Signature:
-    """The signature with every output size a number: where the file leaves one open, an empty picture is run."""
+    """The signature with every output size a number: where the file leaves one open, an empty picture is run.
+
+    It stays as it is where that is impossible: a model that is no detector is to be refused in words.
+    """
     signature = session.signature
-    known = all(isinstance(size, int) for tensor in signature.outputs for size in tensor.shape)
-    if known or one_picture(signature):
+    feeds = blank_feeds(signature)
+    if feeds is None or all(isinstance(size, int) for tensor in signature.outputs for size in tensor.shape):
         return signature
-    picture = np.zeros((1, 3, *input_size(signature)), np.float32)
-    outputs = session.run({signature.inputs[0].name: picture})
+    try:
+        outputs = session.run(feeds)
+    except SemslamError:
+        return signature
     tensors = (replace(tensor, shape=tuple(out.shape)) for tensor, out in zip(signature.outputs, outputs, strict=True))
     return replace(signature, outputs=tuple(tensors))
 
@@ -136,28 +156,37 @@ def _choose(session: Session, signature: Signature, wanted: str) -> Adapter:
 
 
 def _no_adapter(session: Session, reasons: dict[str, str]) -> SemslamError:
-    tried = "\n".join(f"  {name}: {reason}" for name, reason in reasons.items())
     return SemslamError(
         f"No adapter fits detector `{session.path}`",
-        details=f"{session.signature.text()}\nTried\n{tried}",
+        details="\n".join([session.signature.text(), "Tried", *grouped(reasons)]),
         hint="export it in one of these layouts, or name the one it has with `--set extract.adapter=NAME`",
     )
 
 
-def _names(session: Session, classes: int, path: Path | None) -> tuple[str, ...]:
+def grouped(reasons: Mapping[str, str]) -> list[str]:
+    """One line a reason, adapters with the same one together."""
+    names: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        names.setdefault(reason, []).append(name)
+    return [f"  {', '.join(who)}: {reason}" for reason, who in names.items()]
+
+
+def _names(session: Session, counts: tuple[int, ...], path: Path | None) -> tuple[str, ...]:
+    """Class names, as many as the model may have."""
     found: Sequence[str] | None
     if path is not None:
         found, where = names_from_file(path), f"`{path}`"
     else:
         found, where = names_from_metadata(session.signature.metadata), "its metadata"
+    classes = f"{' or '.join(map(str, counts))} classes" if counts else "classes"
     if found is None:
         raise SemslamError(
-            f"Detector `{session.path}` has {classes} classes and does not say their names",
+            f"Detector `{session.path}` has {classes} and does not say their names",
             hint="give a text file with one name a line: `--classes FILE.txt`",
         )
-    if len(found) != classes:
+    if counts and len(found) not in counts:
         raise SemslamError(
-            f"Detector `{session.path}` has {classes} classes, {where} names {len(found)}",
+            f"Detector `{session.path}` has {classes}, {where} names {len(found)}",
             hint="use the class list that the model was trained with: `--classes FILE.txt`",
         )
     return tuple(found)

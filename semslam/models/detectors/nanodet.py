@@ -7,6 +7,7 @@ BGR, normalised by ImageNet's mean and deviation.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 
@@ -14,11 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semslam.models.detections import Detections, Floats, Letterbox, fit, select
-from semslam.models.detectors.layout import Array, best_class, input_size, one_picture
+from semslam.models.detectors.adapter import Adapter, Array, Look
+from semslam.models.detectors.layout import Scaling, best_class, input_size, likely, one_picture, planes, single
 from semslam.models.session import Signature, Tensor
 
-_MEAN = np.array([103.53, 116.28, 123.675], np.float32)
-_DEVIATION = np.array([57.375, 57.12, 58.395], np.float32)
+_SCALING = Scaling(
+    (1 / 58.395, 1 / 57.12, 1 / 57.375), (-123.675 / 58.395, -116.28 / 57.12, -103.53 / 57.375), bgr=True
+)
+"""ImageNet's mean and deviation."""
 
 
 @dataclass(frozen=True)
@@ -46,38 +50,37 @@ class Nanodet:
             return "wants outputs (1, cells, values) of known size"
         return "" if _levels(signature) else "outputs do not pair up as class scores and distances a stride"
 
-    def preprocess(self, rgb: NDArray[np.uint8], signature: Signature) -> tuple[Floats, Letterbox]:
+    def preprocess(
+        self, rgb: NDArray[np.uint8], _depth_m: Floats | None, signature: Signature
+    ) -> tuple[Mapping[str, Array], Letterbox]:
         """(1, 3, h, w) BGR, normalised."""
         height, width = input_size(signature)
         canvas, box = fit(rgb, width, height, fill=0)
-        normalised = (canvas[..., ::-1].astype(np.float32) - _MEAN) / _DEVIATION
-        return np.ascontiguousarray(normalised.transpose(2, 0, 1)[None]), box
+        return {signature.inputs[0].name: planes(canvas, _SCALING)}, box
 
-    def postprocess(
-        self, outputs: list[Array], box: Letterbox, signature: Signature, min_score: float, max_overlap: float
-    ) -> Detections:
+    def postprocess(self, outputs: list[Array], look: Look, signature: Signature) -> Detections:
         """Only cells above the score are decoded; the others cannot survive."""
         height, width = input_size(signature)
         boxes, scores, class_ids = [], [], []
         for level in _levels(signature):
-            best, ids = best_class(np.asarray(outputs[level.scores], np.float32)[0])
-            likely = ~(best < min_score)  # keeps what is not a number, so that it is counted
-            bins = np.asarray(outputs[level.distances], np.float32)[0][likely]
-            boxes.append(_boxes(_centres(height, width, level.stride)[likely], bins, level.stride))
-            scores.append(best[likely])
-            class_ids.append(ids[likely])
+            best, ids = best_class(single(outputs[level.scores]))
+            chosen = likely(best, look.min_score)
+            bins = single(outputs[level.distances])[chosen]
+            boxes.append(_boxes(_centres(height, width, level.stride)[chosen], bins, level.stride))
+            scores.append(best[chosen])
+            class_ids.append(ids[chosen])
         return select(
             np.concatenate(boxes),
             np.concatenate(scores),
             np.concatenate(class_ids),
-            box,
-            min_score=min_score,
-            max_overlap=max_overlap,
+            look.box,
+            min_score=look.min_score,
+            max_overlap=look.max_overlap,
         )
 
-    def classes(self, signature: Signature) -> int:
+    def classes(self, signature: Signature) -> tuple[int, ...]:
         """Number of classes."""
-        return int(signature.outputs[_levels(signature)[0].scores].shape[2])
+        return (int(signature.outputs[_levels(signature)[0].scores].shape[2]),)
 
 
 def _levels(signature: Signature) -> tuple[_Level, ...]:
@@ -95,7 +98,7 @@ def _levels(signature: Signature) -> tuple[_Level, ...]:
             levels.append(_Level(stride, scores, distances))
         elif pair:
             return ()
-    return () if by_cells else tuple(levels)
+    return () if by_cells or len(levels) < 2 else tuple(levels)
 
 
 def _is_distance(tensor: Tensor) -> tuple[bool, bool]:
@@ -118,3 +121,6 @@ def _boxes(centres: Floats, bins: Floats, stride: int) -> Floats:
     spread /= spread.sum(axis=2, keepdims=True)
     distances = (spread @ np.arange(spread.shape[2], dtype=np.float32)) * stride  # (n, 4)
     return np.concatenate([centres - distances[:, :2], centres + distances[:, 2:]], axis=1)
+
+
+ADAPTERS: tuple[Adapter, ...] = (Nanodet(),)

@@ -5,13 +5,25 @@ Source of the layout: the ONNX export of the YOLOv5 project; three anchors a cel
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semslam.models.detections import Detections, Floats, Letterbox, fit, select
-from semslam.models.detectors.layout import Array, best_class, corners, dense_rows, input_size, one_picture, unit_tensor
+from semslam.models.detectors.adapter import Adapter, Array, Look
+from semslam.models.detectors.layout import (
+    UNIT,
+    best_class,
+    corners,
+    dense_rows,
+    input_size,
+    likely,
+    one_picture,
+    planes,
+    single,
+)
 from semslam.models.session import Signature
 
 
@@ -33,20 +45,26 @@ class Yolov5:
             return f"output has {rows} rows, a {width}x{height} input has {anchors} anchors"
         return ""
 
-    def preprocess(self, rgb: NDArray[np.uint8], signature: Signature) -> tuple[Floats, Letterbox]:
+    def preprocess(
+        self, rgb: NDArray[np.uint8], _depth_m: Floats | None, signature: Signature
+    ) -> tuple[Mapping[str, Array], Letterbox]:
         """(1, 3, h, w) RGB, 0 to 1."""
         height, width = input_size(signature)
         canvas, box = fit(rgb, width, height)
-        return unit_tensor(canvas), box
+        return {signature.inputs[0].name: planes(canvas, UNIT)}, box
 
-    def postprocess(
-        self, outputs: list[Array], box: Letterbox, _signature: Signature, min_score: float, max_overlap: float
-    ) -> Detections:
+    def postprocess(self, outputs: list[Array], look: Look, _signature: Signature) -> Detections:
         """Score = objectness * class probability."""
-        rows = np.asarray(outputs[0], np.float32)[0]  # (N, 5 + C)
+        rows = single(outputs[0])  # (N, 5 + C)
+        rows = rows[likely(rows[:, 4], look.min_score)]  # no class probability can lift a lower objectness
         scores, class_ids = best_class(rows[:, 5:], rows[:, 4])
-        return select(corners(rows[:, :4]), scores, class_ids, box, min_score=min_score, max_overlap=max_overlap)
+        return select(
+            corners(rows), scores, class_ids, look.box, min_score=look.min_score, max_overlap=look.max_overlap
+        )
 
-    def classes(self, signature: Signature) -> int:
+    def classes(self, signature: Signature) -> tuple[int, ...]:
         """Number of classes."""
-        return int(signature.outputs[0].shape[2]) - 5
+        return (int(signature.outputs[0].shape[2]) - 5,)
+
+
+ADAPTERS: tuple[Adapter, ...] = (Yolov5(),)

@@ -5,13 +5,25 @@ Source of the layout: the ONNX export of the Ultralytics project; no objectness,
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.models.detections import Detections, Floats, Letterbox, fit, select
-from semslam.models.detectors.layout import Array, best_class, corners, input_size, one_picture, unit_tensor
+from semslam.models.detections import Detections, Floats, Indices, Letterbox, fit, select
+from semslam.models.detectors.adapter import Adapter, Array, Look
+from semslam.models.detectors.layout import (
+    UNIT,
+    corners,
+    input_size,
+    likely,
+    names_stated,
+    one_picture,
+    one_table,
+    planes,
+    single,
+)
 from semslam.models.session import Signature
 
 
@@ -23,33 +35,57 @@ class Yolov8:
 
     def mismatch(self, signature: Signature) -> str:
         """Why a model is not of this layout; empty if it is."""
-        problem = one_picture(signature)
-        if problem:
-            return problem
-        if len(signature.outputs) != 1 or len(signature.outputs[0].shape) != 3:
-            return f"wants one output of three dimensions, found {len(signature.outputs)} outputs"
-        _, channels, rows = signature.outputs[0].shape
-        if not isinstance(channels, int) or channels < 5:
-            return f"second dimension of the output is {channels}, wants 4 + classes"
-        if isinstance(rows, int) and rows <= channels:
-            return f"output has {rows} candidates of {channels} values: more candidates than values expected"
-        return ""
+        return one_picture(signature) or candidate_columns(signature)
 
-    def preprocess(self, rgb: NDArray[np.uint8], signature: Signature) -> tuple[Floats, Letterbox]:
+    def preprocess(
+        self, rgb: NDArray[np.uint8], _depth_m: Floats | None, signature: Signature
+    ) -> tuple[Mapping[str, Array], Letterbox]:
         """(1, 3, h, w) RGB, 0 to 1."""
         height, width = input_size(signature)
         canvas, box = fit(rgb, width, height)
-        return unit_tensor(canvas), box
+        return {signature.inputs[0].name: planes(canvas, UNIT)}, box
 
-    def postprocess(
-        self, outputs: list[Array], box: Letterbox, _signature: Signature, min_score: float, max_overlap: float
-    ) -> Detections:
+    def postprocess(self, outputs: list[Array], look: Look, _signature: Signature) -> Detections:
         """The best class of each candidate."""
-        columns = np.asarray(outputs[0], np.float32)[0]  # (4 + C, N)
-        scores, class_ids = best_class(columns[4:].T)
-        boxes = corners(np.ascontiguousarray(columns[:4].T))
-        return select(boxes, scores, class_ids, box, min_score=min_score, max_overlap=max_overlap)
+        return read_columns(outputs[0], look)
 
-    def classes(self, signature: Signature) -> int:
+    def classes(self, signature: Signature) -> tuple[int, ...]:
         """Number of classes."""
-        return int(signature.outputs[0].shape[1]) - 4
+        return (int(signature.outputs[0].shape[1]) - 4,)
+
+
+def candidate_columns(signature: Signature) -> str:
+    """Why the output is not one of (N, 4 + classes, candidates); empty if it is."""
+    problem = one_table(signature)
+    if problem:
+        return problem
+    _, channels, rows = signature.outputs[0].shape
+    if not isinstance(channels, int) or channels < 5:
+        return f"second dimension of the output is {channels}, wants 4 + classes"
+    if isinstance(rows, int) and rows <= channels:
+        return f"output has {rows} candidates of {channels} values: more candidates than values expected"
+    if isinstance(rows, int) and names_stated(signature) == rows - 4 != channels - 4:
+        return f"its metadata names {rows - 4} classes: rows of {rows} values"
+    return ""
+
+
+def read_columns(output: Array, look: Look) -> Detections:
+    """Detections from (1, 4 + C, N)."""
+    columns = single(output)
+    scores, class_ids, chosen = best_of_columns(columns[4:], look.min_score)
+    boxes = corners(columns[:4, chosen].T)
+    return select(boxes, scores, class_ids, look.box, min_score=look.min_score, max_overlap=look.max_overlap)
+
+
+def best_of_columns(class_scores: Floats, min_score: float) -> tuple[Floats, Indices, Indices]:
+    """Scores and classes of the candidates of (C, N) worth decoding, and which they are.
+
+    The maximum goes along the rows as they lie in memory; only the few candidates above the score are turned.
+    """
+    chosen = likely(class_scores.max(axis=0), min_score)
+    few = class_scores[:, chosen]  # (C, n)
+    class_ids = few.argmax(axis=0)
+    return few[class_ids, np.arange(len(chosen))], class_ids, chosen
+
+
+ADAPTERS: tuple[Adapter, ...] = (Yolov8(),)

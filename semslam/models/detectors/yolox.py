@@ -6,6 +6,7 @@ are BGR, 0 to 255, fitted to the upper left corner.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 
@@ -13,7 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semslam.models.detections import Detections, Floats, Letterbox, fit, select
-from semslam.models.detectors.layout import Array, best_class, dense_rows, input_size, one_picture
+from semslam.models.detectors.adapter import Adapter, Array, Look
+from semslam.models.detectors.layout import (
+    PIXELS_BGR,
+    best_class,
+    dense_rows,
+    input_size,
+    likely,
+    one_picture,
+    planes,
+    single,
+)
 from semslam.models.session import Signature
 
 _STRIDES = (8, 16, 32)
@@ -42,30 +53,32 @@ class Yolox:
             )
         return ""
 
-    def preprocess(self, rgb: NDArray[np.uint8], signature: Signature) -> tuple[Floats, Letterbox]:
+    def preprocess(
+        self, rgb: NDArray[np.uint8], _depth_m: Floats | None, signature: Signature
+    ) -> tuple[Mapping[str, Array], Letterbox]:
         """(1, 3, h, w) BGR."""
         height, width = input_size(signature)
         canvas, box = fit(rgb, width, height, centred=False)
-        return np.ascontiguousarray(canvas[..., ::-1].transpose(2, 0, 1)[None], np.float32), box
+        return {signature.inputs[0].name: planes(canvas, PIXELS_BGR)}, box
 
-    def postprocess(
-        self, outputs: list[Array], box: Letterbox, signature: Signature, min_score: float, max_overlap: float
-    ) -> Detections:
+    def postprocess(self, outputs: list[Array], look: Look, signature: Signature) -> Detections:
         """Boxes from offsets within their cell and log sizes; score = objectness * class probability."""
-        rows = np.asarray(outputs[0], np.float32)[0]  # (N, 5 + C)
+        rows = single(outputs[0])  # (N, 5 + C)
+        chosen = likely(rows[:, 4], look.min_score)  # no class probability can lift a lower objectness
+        rows = rows[chosen]
         scores, class_ids = best_class(rows[:, 5:], rows[:, 4])
         centres, sizes = rows[:, :2], rows[:, 2:4]
         if not self.decoded:
             cells, strides = _cells(*input_size(signature))
             with np.errstate(over="ignore"):
-                centres, sizes = (centres + cells) * strides, np.exp(sizes) * strides
+                centres = (centres + cells[chosen]) * strides[chosen]
+                sizes = np.exp(sizes) * strides[chosen]
         boxes = np.concatenate([centres - sizes / 2, centres + sizes / 2], axis=1)
-        return select(boxes, scores, class_ids, box, min_score=min_score, max_overlap=max_overlap)
+        return select(boxes, scores, class_ids, look.box, min_score=look.min_score, max_overlap=look.max_overlap)
 
-    def classes(self, signature: Signature) -> int:
+    def classes(self, signature: Signature) -> tuple[int, ...]:
         """Number of classes."""
-        last = signature.outputs[0].shape[2]
-        return int(last) - 5
+        return (int(signature.outputs[0].shape[2]) - 5,)
 
 
 @cache
@@ -77,3 +90,6 @@ def _cells(height: int, width: int) -> tuple[Floats, Floats]:
         places.append(np.stack([columns.ravel(), rows.ravel()], axis=1))
         strides.append(np.full((rows.size, 1), stride))
     return np.concatenate(places).astype(np.float32), np.concatenate(strides).astype(np.float32)
+
+
+ADAPTERS: tuple[Adapter, ...] = (Yolox(), Yolox("yolox_decoded", decoded=True))

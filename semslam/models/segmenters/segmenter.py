@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from semslam.errors import SemslamError
 from semslam.models.segmenters.box import BoxSegmenter
 from semslam.models.segmenters.depth_box import DepthBoxSegmenter
+from semslam.models.segmenters.prompted import PromptedSegmenter, is_prompted
 from semslam.models.segmenters.sam import SamSegmenter
 
 
@@ -28,8 +29,8 @@ def open_segmenter(kind: str, encoder: str = "", decoder: str = "", threads: int
 
     Args:
         kind: auto, sam, depth_box or box; auto is sam if its two files are given, else depth_box.
-        encoder: ONNX file of the image encoder, for sam.
-        decoder: ONNX file of the mask decoder, for sam.
+        encoder: ONNX file of the image encoder, for sam: semslam's own (its metadata says so) or one of SAM's kind.
+        decoder: ONNX file of the mask decoder that belongs to it.
         threads: threads within an operator.
 
     Raises:
@@ -44,5 +45,6 @@ def open_segmenter(kind: str, encoder: str = "", decoder: str = "", threads: int
         hint = "give `--segmenter-encoder FILE.onnx --segmenter-decoder FILE.onnx`"
         raise SemslamError("`extract.segmenter` is sam, but no models are given", hint=hint)
     if kind == "sam" or (kind == "auto" and encoder):
-        return SamSegmenter.open(Path(encoder), Path(decoder), threads=threads)
+        pair = PromptedSegmenter if is_prompted(Path(encoder)) else SamSegmenter
+        return pair.open(Path(encoder), Path(decoder), threads=threads)
     return BoxSegmenter() if kind == "box" else DepthBoxSegmenter()

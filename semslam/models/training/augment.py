@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -180,23 +181,31 @@ def photographed(rgb: Colour, rng: Rng, strength: float) -> Colour:
     """In other light and by another camera: gamma, gain, cast, saturation, vignette, blur, fewer pixels, noise."""
     curve = rng.uniform(0.65, 1.5) ** strength
     gain = np.exp(rng.uniform(-0.5, 0.3) * strength + rng.uniform(-0.15, 0.15, 3) * strength).astype(np.float32)
-    rgb = np.clip(cv2.pow(rgb, float(curve)) * gain, 0, 1)
+    rgb = np.clip(np.asarray(cv2.pow(rgb, float(curve)), np.float32) * gain, 0, 1)
     if rng.random() < 0.5:
         share = float(rng.uniform(1 - 0.7 * strength, 1 + 0.4 * strength)) if rng.random() < 0.85 else 0.0
-        rgb = cv2.transform(rgb, np.asarray(share * np.eye(3) + (1 - share) / 3, np.float32))
+        mixed = cv2.transform(rgb, np.asarray(share * np.eye(3) + (1 - share) / 3, np.float32))
+        rgb = np.asarray(mixed, np.float32)
     if rng.random() < 0.25:
         rgb = rgb * (1 + strength * (_cloud(rgb.shape[:2], rng)[..., :1] - 0.5))
+    rgb = _softened(rgb, rng)
+    noise = rng.standard_normal(rgb.shape, np.float32) * np.float32(rng.uniform(0, 0.04) * strength)
+    return np.clip(rgb + noise, 0, 1)
+
+
+def _softened(rgb: Colour, rng: Rng) -> Colour:
+    """Fewer pixels, out of focus, or moved during the exposure; or none of it."""
     height, width = rgb.shape[:2]
+    soft: NDArray[Any] = rgb
     if rng.random() < 0.3:
         share = float(rng.uniform(0.35, 0.9))
         small = cv2.resize(rgb, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
-        rgb = cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
+        soft = cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
     elif rng.random() < 0.2:
-        rgb = cv2.GaussianBlur(rgb, (0, 0), float(rng.uniform(0.4, 1.3)))
+        soft = cv2.GaussianBlur(rgb, (0, 0), float(rng.uniform(0.4, 1.3)))
     elif rng.random() < 0.15:
-        rgb = cv2.filter2D(rgb, -1, _smear(rng))
-    noise = rng.standard_normal(rgb.shape, np.float32) * np.float32(rng.uniform(0, 0.04) * strength)
-    return np.clip(rgb + noise, 0, 1)
+        soft = cv2.filter2D(rgb, -1, _smear(rng))
+    return np.asarray(soft, np.float32)
 
 
 def _smear(rng: Rng) -> NDArray[np.float32]:

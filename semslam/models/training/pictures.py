@@ -6,6 +6,7 @@ Reads   views        data_spec.md, table 15: a folder with one file a home, as `
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,6 +25,10 @@ from semslam.tables.spec import VIEWS
 MIN_SHARE, MIN_PIXELS, MIN_SIDE_PX = 0.25, 480, 16
 """An object counts from this share of its silhouette, this many visible pixels and this shorter side on, at 640x480;
 lesser glimpses are neither wanted nor punished."""
+CLASSES = (
+    "chair", "table", "sofa", "bed", "bookshelf", "dresser", "plant", "lamp", "tv", "bin", "refrigerator", "toilet",
+)  # fmt: skip
+"""Of simulated homes; a test compares them with the simulator's."""
 _AREA_PX, _WIDTH_PX = 640 * 480, 640
 
 
@@ -84,6 +89,8 @@ class PictureSet:
     rows: Sequence[dict[str, Any]]
     digest: str
     """Of names and sizes of the files: another set has another one."""
+    origin: str = ""
+    """The command that made it, as far as the folder tells."""
 
     @staticmethod
     def open(folder: Path, *, homes: slice = slice(None)) -> PictureSet:
@@ -102,7 +109,7 @@ class PictureSet:
                 f"Files in `{folder}` disagree about the classes", hint="keep each set in its own folder"
             )
         rows = [row for file in files for row in _rows(file)]
-        return PictureSet(names.pop(), rows, _fingerprint(paths))
+        return PictureSet(names.pop(), rows, _fingerprint(paths), _origin(folder, len(paths)))
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -149,12 +156,23 @@ def _picture(row: dict[str, Any]) -> Picture:
         raise SemslamError("A view's instance image cannot be decoded", hint="make the views again")
     boxes = np.asarray(row["boxes_px"], np.float64).reshape(-1, 4).tolist()
     objects = tuple(
-        SeenObject(int(instance), int(class_id), *box, int(pixels), float(share), bool(cut))
-        for instance, class_id, box, pixels, share, cut in zip(
+        SeenObject(int(instance), int(class_id), left, top, right, bottom, int(pixels), float(share), bool(cut))
+        for instance, class_id, (left, top, right, bottom), pixels, share, cut in zip(
             row["instance"], row["class_id"], boxes, row["pixels"], row["share"], row["cut"], strict=True
         )
     )
     return Picture(decode_colour(row["colour"]), decode_depth(row["depth"]), np.asarray(instances, np.uint16), objects)
+
+
+def _origin(folder: Path, homes: int) -> str:
+    """What to type for the same views, from the plan that `semslam train pictures` leaves; else the folder's name."""
+    try:
+        recipe = json.loads((folder / "plan.json").read_text())["recipe"]
+        unfamiliar = " --unfamiliar" if recipe["unfamiliar"] else ""
+        made = f"--homes {homes} --views {recipe['views']} --seed {recipe['seed']}{unfamiliar}"
+    except (OSError, ValueError, KeyError, TypeError):
+        return folder.name
+    return f"semslam train pictures {folder.name} {made}"
 
 
 def _fingerprint(paths: Sequence[Path]) -> str:

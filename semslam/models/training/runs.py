@@ -6,8 +6,6 @@ A run's folder holds `checkpoint.pt` and `curves.csv` while it lasts, and at its
 from __future__ import annotations
 
 import datetime
-import hashlib
-import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,16 +18,16 @@ from torch import nn
 from semslam.errors import SemslamError
 from semslam.models.class_names import names_from_file
 from semslam.models.nets.detector import INPUT_HEIGHT, INPUT_WIDTH, Detector, DetectorShape, Exported
+from semslam.models.nets.segmenter import Segmenter
+from semslam.models.onnxfile import file_digest
 from semslam.models.training.detector import Batches, detection_loss
 from semslam.models.training.export import export_onnx
-from semslam.models.training.pictures import PictureSet
+from semslam.models.training.judge import box_table, judged_detector, judged_segmenter, mask_table
+from semslam.models.training.pictures import CLASSES, PictureSet
+from semslam.models.training.segmenter import PromptBatches, export_segmenter, mask_loss, new_segmenter
 from semslam.models.training.trainer import CHECKPOINT, Progress, Schedule, fit, read_checkpoint
 
 DETECTOR = "detector.onnx"
-CLASSES = (
-    "chair", "table", "sofa", "bed", "bookshelf", "dresser", "plant", "lamp", "tv", "bin", "refrigerator", "toilet",
-)  # fmt: skip
-"""Of simulated homes; a test compares them with the simulator's."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +43,10 @@ class Run:
     device: str = "auto"
     """cpu, cuda, or auto: cuda where there is one."""
     watch: Callable[[Progress], None] | None = field(default=None, compare=False)
+    test: Path | None = None
+    """Folder of views to judge the result on."""
+    command: str = ""
+    """What to type to make it again; for the card."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +71,16 @@ def asked(
     threads: int = 2,
     device: str = "auto",
     watch: Callable[[Progress], None] | None = None,
+    test: Path | None = None,
 ) -> Run:
     """What a command asks for; None means the value of the shipped model."""
     usual = TASKS[task].defaults
     schedule = replace(
         usual, steps=steps or usual.steps, batch=batch or usual.batch, peak_rate=rate or usual.peak_rate, seed=seed
     )
-    return Run(views, out, schedule, threads, device, watch)
+    command = f"semslam train {task} {views.name} --out {out.name} --steps {schedule.steps} --batch {schedule.batch}"
+    command += f" --rate {schedule.peak_rate:g} --seed {seed} --threads {threads}"
+    return Run(views, out, schedule, threads, device, watch, test, command)
 
 
 def train_detector(run: Run) -> list[Path]:
@@ -87,12 +92,92 @@ def train_detector(run: Run) -> list[Path]:
     device = prepare(run)
     pictures = PictureSet.open(run.data)
     network = new_detector(pictures.class_names, run.schedule.seed)
-    network = network.to(device=device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network = network.to(device=device, memory_format=torch.channels_last)
     batches = Batches.of(pictures, steps=run.schedule.steps, batch=run.schedule.batch, seed=run.schedule.seed)
     facts = {"task": "detector", "classes": list(pictures.class_names), "data": pictures.digest}
     trained = fit(network, detection_loss, batches, run.schedule, run.out, facts=facts, watch=run.watch)
-    export_detector(trained, run.out / DETECTOR, pictures.class_names)
-    return [run.out / DETECTOR]
+    path = run.out / DETECTOR
+    export_detector(trained, path, pictures.class_names)
+    tables = [box_table(judged_detector(path, PictureSet.open(run.test)))] if run.test else []
+    facts = {
+        "input": f"`images` (N, 3, {INPUT_HEIGHT}, {INPUT_WIDTH}) RGB 0 to 1, `depth` (N, 1, same) metres, 0 missing",
+        "output": "`output0` (N, 4 + classes, cells), YOLOv8's layout, boxes in input pixels",
+        "classes": ", ".join(pictures.class_names),
+        **_made(run, network, pictures),
+    }
+    write_card(path, "Object detector from colour and depth", _ON_HOMES, facts, _judged_on(run, tables))
+    return [path, path.with_suffix(".md")]
+
+
+def train_segmenter(run: Run) -> list[Path]:
+    """Train a segmenter and export it. A run that was killed goes on where it was.
+
+    Raises:
+        SemslamError: no views, a folder with another run, no such device.
+    """
+    device = prepare(run)
+    pictures = PictureSet.open(run.data)
+    network = new_segmenter(run.schedule.seed)
+    network = network.to(device=device, memory_format=torch.channels_last)
+    batches = PromptBatches.of(pictures, steps=run.schedule.steps, batch=run.schedule.batch, seed=run.schedule.seed)
+    facts = {"task": "segmenter", "data": pictures.digest}
+    trained = fit(network, mask_loss, batches, run.schedule, run.out, facts=facts, watch=run.watch)
+    encoder, decoder = export_segmenter(_segmenter(trained), run.out)
+    tables = [mask_table(judged_segmenter(encoder, decoder, PictureSet.open(run.test)))] if run.test else []
+    described = {
+        "input": "`images` (1, 3, h, w) RGB 0 to 1, `depth` (1, 1, h, w) metres; then `features` and `boxes` (N, 4)",
+        "output": "`masks` (N, m, m) logits on a grid over each box and its margin (metadata `box_margin`)",
+        "decoder": f"{decoder.name}, SHA-256 `{file_digest(decoder)}`",
+        **_made(run, network, pictures),
+    }
+    write_card(encoder, "Box-prompted segmenter of colour and depth", _ON_HOMES, described, _judged_on(run, tables))
+    return [encoder, decoder, encoder.with_suffix(".md")]
+
+
+def exported_segmenter(out: Path, run: Path | None, seed: int | None, _classes: Path | None) -> list[Path]:
+    """Export what a run has learned so far, or random weights, into a folder.
+
+    Raises:
+        SemslamError: no such run.
+    """
+    network = new_segmenter(seed or 0)
+    if run is not None:
+        network.load_state_dict(_averaged(run, "segmenter", network))
+    return export_segmenter(network, out)
+
+
+def _segmenter(network: nn.Module) -> Segmenter:
+    if not isinstance(network, Segmenter):
+        raise TypeError("not a segmenter of ours")
+    return network
+
+
+_ON_HOMES = (
+    "Trained on simulated homes alone, with pictures changed at random in colour, light, sharpness, noise, scale and "
+    "depth. Expect little of it on photographs."
+)
+
+
+def _made(run: Run, network: nn.Module, pictures: PictureSet) -> dict[str, Any]:
+    """How a model came about, for its card."""
+    schedule = run.schedule
+    return {
+        "parameters": f"{parameters_of(network):,}",
+        "data": f"{len(pictures):,} views, `{pictures.origin}`, digest {pictures.digest}",
+        "command": f"`{run.command}`",
+        "seed": schedule.seed,
+        "steps": f"{schedule.steps:,} of {schedule.batch} views",
+        "licence": "Apache-2.0, model and data",
+    }
+
+
+def _judged_on(run: Run, tables: Sequence[str]) -> list[str]:
+    if not run.test:
+        return ["Not judged: `--test VIEWS` was not given."]
+    text = (
+        f"On {len(PictureSet.open(run.test)):,} views of homes it has not seen (`{run.test.name}`), objects that count:"
+    )
+    return [text, *tables]
 
 
 def exported_detector(out: Path, run: Path | None, seed: int | None, classes: Path | None) -> list[Path]:
@@ -119,6 +204,7 @@ def prepare(run: Run) -> torch.device:
     cv2.setNumThreads(1)
     torch.set_num_threads(run.threads)
     torch.use_deterministic_algorithms(True, warn_only=True)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # nobody reads it; filling it takes time
     name = run.device if run.device != "auto" else ("cuda" if torch.cuda.is_available() else "cpu")
     if name == "cuda" and not torch.cuda.is_available():
         raise SemslamError("This torch finds no GPU", hint="train with `--device cpu`")
@@ -137,24 +223,27 @@ def trained_detector(folder: Path) -> tuple[Detector, tuple[str, ...]]:
     Raises:
         SemslamError: no checkpoint there, or one of another network.
     """
-    stored = read_checkpoint(folder / CHECKPOINT)
-    if stored["run"].get("task") != "detector":
-        raise SemslamError(
-            f"`{folder}` is not the run of a detector", hint="name the folder of `semslam train detector`"
-        )
-    names = tuple(stored["run"]["classes"])
+    names = tuple(read_checkpoint(folder / CHECKPOINT)["run"].get("classes", ()))
     network = new_detector(names, 0)
+    network.load_state_dict(_averaged(folder, "detector", network))
+    return network.eval(), names
+
+
+def _averaged(folder: Path, task: str, network: nn.Module) -> Mapping[str, Any]:
+    """Averaged weights of a run of this task; `network` tells their shapes."""
+    stored = read_checkpoint(folder / CHECKPOINT)
+    if stored["run"].get("task") != task:
+        raise SemslamError(f"`{folder}` is not the run of a {task}", hint=f"name that of `semslam train {task}`")
     average = torch.optim.swa_utils.AveragedModel(network, use_buffers=True)
     average.load_state_dict(stored["average"])
-    network.load_state_dict(average.module.state_dict())
-    return network.eval(), names
+    return average.module.state_dict()
 
 
 def export_detector(network: nn.Module, path: Path, class_names: Sequence[str]) -> None:
     """Write a detector as ONNX; any number of pictures at once."""
     if not isinstance(network, Detector):
         raise TypeError("not a detector of ours")
-    plain = network.to(device=torch.device("cpu"), memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+    plain = network.to(device=torch.device("cpu"), memory_format=torch.contiguous_format)
     batch = torch.export.Dim("batch", min=1, max=64)
     export_onnx(
         Exported(plain.eval()),
@@ -177,25 +266,17 @@ def parameters_of(network: nn.Module) -> int:
     return sum(value.numel() for value in network.parameters())
 
 
-def facts_of(path: Path) -> dict[str, str]:
-    """What a card says of a file."""
-    content = path.read_bytes()
-    return {
-        "file": f"{path.name}, {len(content) / 1e6:.2f} MB",
-        "SHA-256": f"`{hashlib.sha256(content).hexdigest()}`",
-    }
-
-
-def write_card(path: Path, title: str, text: str, facts: Mapping[str, Any], tables: Sequence[str]) -> None:
-    """A model card as Markdown: a title, a paragraph, facts, tables."""
-    rows = "\n".join(f"| {name} | {value} |" for name, value in facts.items())
-    stamp = {"torch": torch.__version__, "processor": platform.machine(), "date": datetime.date.today()}
-    rows += "".join(f"\n| {name} | {value} |" for name, value in stamp.items())
-    body = "\n\n".join([f"# {title}", text, f"| | |\n|---|---|\n{rows}", *tables])
-    path.write_text(body + "\n", encoding="utf-8")
+def write_card(path: Path, title: str, text: str, facts: Mapping[str, Any], more: Sequence[str]) -> None:
+    """The card of a model as Markdown beside it: a title, a paragraph, facts, and what it is worth."""
+    own = {"file": f"{path.name}, {path.stat().st_size / 1e6:.2f} MB", "SHA-256": f"`{file_digest(path)}`"}
+    stamp = {"torch": torch.__version__, "date": datetime.date.today()}
+    rows = "\n".join(f"| {name} | {value} |" for name, value in {**own, **facts, **stamp}.items())
+    body = "\n\n".join([f"# {title}", text, f"| | |\n|---|---|\n{rows}", *more])
+    path.with_suffix(".md").write_text(body + "\n", encoding="utf-8")
 
 
 TASKS: Mapping[str, Task] = {
     "detector": Task(Schedule(steps=14000, batch=16), train_detector, exported_detector),
+    "segmenter": Task(Schedule(steps=9000, batch=4), train_segmenter, exported_segmenter),
 }
 """What `semslam train` can train."""
