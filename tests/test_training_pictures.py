@@ -120,3 +120,32 @@ def test_what_counts_scales_with_the_picture() -> None:
     small = resized(picture, 320, 240)
     assert len(small.objects) == len(picture.objects)
     assert [item.instance for item in small.counting] == [item.instance for item in picture.counting]
+
+
+def test_ids_without_an_object_are_never_taken_for_one() -> None:
+    """People and slivers have pixels and no entry; a pasted object gets an id that nobody has."""
+    picture, other = box_picture(1), box_picture(2)
+    instances = picture.instances.copy()
+    instances[:10, :10] = 4  # the next free one, as far as the entries tell
+    mixed = pasted(Picture(picture.rgb, picture.depth_m, instances, picture.objects), other, np.random.default_rng(0))
+    for item in mixed.objects:
+        assert box_of(mixed, item) == (item.left, item.top, item.right, item.bottom)
+
+
+def test_an_object_cut_by_the_picture_s_edge_has_the_pixels_that_are_left() -> None:
+    """Not those of an evenly filled box; its share falls with them."""
+    for seed in range(20):
+        picture = box_picture(seed, objects=2)
+        for item in moved(picture, np.random.default_rng(seed), 1.5).objects:
+            before = next(one for one in picture.objects if one.instance == item.instance)
+            if item.cut:
+                assert item.share < 1
+            assert item.share <= before.share
+
+
+@pytest.mark.parametrize("size", [(384, 288), (448, 336), (320, 240), (256, 192)])
+def test_masks_shrink_about_their_middle(size: tuple[int, int]) -> None:
+    """The truth of a smaller picture lies where its boxes do, to half a pixel."""
+    picture = resized(box_picture(5, width=640, height=480, objects=2), *size)
+    for item in picture.objects:
+        np.testing.assert_allclose(box_of(picture, item), (item.left, item.top, item.right, item.bottom), atol=0.51)

@@ -45,8 +45,9 @@ def tiny_fit(folder: Path, *, stop_at: int | None = None, seed: int = 1) -> Any:
 
     torch.manual_seed(seed)
     network = torch.nn.Linear(1, 1)
-    schedule = Schedule(steps=40, batch=16, seed=seed, peak_rate=0.1, warm_up=5, average=0.5, checkpoint_s=0.0)
-    return fit(network, loss, batch_of, schedule, folder, facts={"task": "line"}, report_every=10)
+    timing = {"checkpoint_s": 0.0, "report_every": 10}
+    schedule = Schedule(steps=40, batch=16, seed=seed, peak_rate=0.1, warm_up=5, average=0.5, **timing)
+    return fit(network, loss, batch_of, schedule, folder, facts={"task": "line"})
 
 
 def test_a_killed_run_goes_on_as_if_nothing_had_happened(tmp_path: Path) -> None:
@@ -58,8 +59,9 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(tmp_path: Path) -> None
     resumed = tiny_fit(tmp_path / "cut")
     for name, value in whole.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name])
-    rows = list(csv.reader((tmp_path / "cut" / "curves.csv").read_text().splitlines()))
-    assert [row[0] for row in rows] == ["step", "10", "20", "30", "40"]
+    curves = (tmp_path / "cut" / "curves.csv").read_text()
+    assert curves == (tmp_path / "whole" / "curves.csv").read_text()
+    assert [row[0] for row in csv.reader(curves.splitlines())] == ["step", "10", "20", "30", "40"]
 
 
 def test_it_learns(tmp_path: Path) -> None:
@@ -144,7 +146,8 @@ def test_kill_9_costs_nothing_but_time(trained: Path, tmp_path: Path) -> None:
         "from semslam.models.training.runs import asked, train_detector\n"
         f"run = asked('detector', views=Path(sys.argv[1]), out=Path(sys.argv[2]), steps={STEPS}, batch=2, threads=1,"
         " device='cpu')\n"
-        "train_detector(dataclasses.replace(run, schedule=dataclasses.replace(run.schedule, checkpoint_s=0.0)))\n"
+        "schedule = dataclasses.replace(run.schedule, checkpoint_s=0.0, report_every=1)\n"
+        "train_detector(dataclasses.replace(run, schedule=schedule))\n"
     )
     command = [sys.executable, "-c", script, str(views), str(tmp_path / "run")]
     process = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"})
@@ -171,12 +174,15 @@ def test_batches_depend_on_seed_and_step_alone(tmp_path: Path) -> None:
 
 
 def test_an_object_is_answered_for_by_cells_inside_it() -> None:
-    """Cells that answer lie in the box and are asked for its class and sides; cells on a glimpse count for nothing."""
+    """Cells that answer lie in the box and asked for its class and sides; on a glimpse its class does not count."""
     centres, strides = cells(256, 192)
     boxes = torch.cat([centres - 20, centres + 20], 1)
     scores = torch.full((len(centres), 2), 0.01)
     truth = Examples(
-        torch.tensor([[40.0, 40.0, 90.0, 90.0]]), torch.tensor([1]), torch.tensor([[150.0, 100.0, 200.0, 150.0]])
+        torch.tensor([[40.0, 40.0, 90.0, 90.0]]),
+        torch.tensor([1]),
+        torch.tensor([[150.0, 100.0, 200.0, 150.0]]),
+        torch.tensor([0]),
     )
     wanted, goal, used = assign(boxes, scores, centres, strides, truth)
     answering = wanted.sum(1) > 0
@@ -186,7 +192,8 @@ def test_an_object_is_answered_for_by_cells_inside_it() -> None:
     assert wanted[:, 0].sum() == 0
     assert (goal[answering] == truth.boxes[0]).all()
     glimpsed = ((centres > torch.tensor([150.0, 100.0])) & (centres < torch.tensor([200.0, 150.0]))).all(1)
-    assert (used[glimpsed] == 0).all()
+    assert (used[glimpsed, 0] == 0).all()
+    assert (used[glimpsed, 1] == 1).all()
     assert (used[~glimpsed] == 1).all()
 
 
@@ -210,9 +217,9 @@ def test_a_finished_run_leaves_a_card_with_what_it_is_worth(tmp_path: Path) -> N
     """Data, seed, command, digest and average precision on views given for it."""
     import hashlib
 
-    views = write_views(tmp_path / "views")
+    views, unseen = write_views(tmp_path / "views"), write_views(tmp_path / "unseen", first=7)
     pytest.importorskip("pycocotools", reason="needs the extra [train]")
-    model, card = train_detector(small_run(views, tmp_path / "run", test=views))
+    model, card = train_detector(small_run(views, tmp_path / "run", test=unseen))
     text = card.read_text()
     assert hashlib.sha256(model.read_bytes()).hexdigest() in text
     assert f"--steps {STEPS} --batch 2" in text
@@ -228,3 +235,18 @@ def test_random_networks_are_exported_by_seed(task: str, tmp_path: Path) -> None
     )
     assert [path.read_bytes() for path in one] == [path.read_bytes() for path in two]
     assert [path.read_bytes() for path in one] != [path.read_bytes() for path in three]
+
+
+def test_homes_that_are_trained_on_are_no_test(tmp_path: Path) -> None:
+    """Refused before the training begins, with what to type."""
+    views = write_views(tmp_path / "views", homes=2)
+    with pytest.raises(SemslamError, match="1 homes of") as caught:
+        train_detector(small_run(views, tmp_path / "run", test=write_views(tmp_path / "test", first=1)))
+    assert "--seed" in (caught.value.hint or "")
+    assert not (tmp_path / "run").exists()
+
+
+def test_another_task_s_run_is_not_exported(trained: Path, tmp_path: Path) -> None:
+    """A detector's run makes no segmenter."""
+    with pytest.raises(SemslamError, match="not the run of a segmenter"):
+        TASKS["segmenter"].export(tmp_path, trained, None, None)

@@ -43,10 +43,10 @@ def _seen(instances: np.ndarray[Any, Any], number: int, kind: int) -> SeenObject
     return SeenObject(number, kind, left, top, left + width, top + height, int(mask.sum()), 1.0, False)
 
 
-def write_views(folder: Path, homes: int = 1, views: int = 4, **size: int) -> Path:
+def write_views(folder: Path, homes: int = 1, views: int = 4, first: int = 0, **size: int) -> Path:
     """A folder of such views as `semslam train pictures` would leave it."""
     folder.mkdir(parents=True, exist_ok=True)
-    for home in range(homes):
+    for home in range(first, first + homes):
         rows = [_row(index, box_picture(100 * home + index, **size)) for index in range(views)]
         columns = {column.name: [row[column.name] for row in rows] for column in VIEWS.columns}
         meta = {"classes": list(NAMES), "variant": "boxes", "seed": home, "unfamiliar": False}

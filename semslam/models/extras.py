@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 from semslam.errors import SemslamError
 
-_FOR_TRAINING = ("torch", "onnx", "onnxscript")
+_FOR_TRAINING = ("torch", "onnx", "onnxscript", "pycocotools")
 
 
 def require_torch() -> None:

@@ -612,7 +612,9 @@ def _training_options(command: _Command) -> _Command:
             click.option("--test", type=click.Path(path_type=Path), help="Views of other homes, to judge the result."),
             click.option("--steps", type=click.IntRange(1), help="Default: as the shipped model."),
             click.option("--batch", type=click.IntRange(1), help="Pictures a step. Default: as the shipped model."),
-            click.option("--rate", type=float, help="Peak learning rate. Default: as the shipped model."),
+            click.option(
+                "--rate", type=click.FloatRange(0, min_open=True), help="Peak learning rate. Default: likewise."
+            ),
             click.option("--seed", type=int, default=1, show_default=True, help="Of everything random."),
             click.option("--threads", type=click.IntRange(1), default=2, show_default=True, help="Of torch."),
             click.option("--device", type=click.Choice(("auto", "cpu", "cuda")), default="auto", show_default=True),
@@ -715,6 +717,8 @@ def models_export(task: str, out: Path, run_folder: Path | None, random_seed: in
 
     if (run_folder is None) == (random_seed is None):
         raise UsageError("Export what a training learned, or random weights", hint="give `--run` or `--random`")
+    if classes is not None and (run_folder is not None or task != "detector"):
+        raise UsageError("`--classes` names the classes of a random detector alone", hint="leave it out")
     require_torch()
     from semslam.models.training.runs import TASKS
 

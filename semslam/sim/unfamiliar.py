@@ -19,8 +19,9 @@ from semslam.geometry.camera import Camera
 from semslam.sim.home import LIGHTS, Colour, Fixture, Home, Light, Look, Part, Piece, Vector
 from semslam.sim.vehicle import RobotSpec
 
-HEIGHT_M, PITCH_DEG, FIELD_DEG = (0.9, 1.3), (10.0, 25.0), (55.0, 65.0)
-"""Camera height, how far its nose is down, field of view across. Training: 0.3 to 0.75 m, 0 to 20, 70 to 95 degrees."""
+HEIGHT_M, PITCH_DEG, FIELD_DEG = (0.9, 1.3), (20.0, 30.0), (40.0, 47.0)
+"""Camera height, how far its nose is down, field of view across. Training has 0.3 to 0.75 m, 0 to 20 degrees, and 70 to
+95 degrees, by zooming in from 48 on."""
 
 _WALLS = ("paint", "plaster", "stripes", "damask", "floral", "lattice", "dots", "brick", "planks", "tiles", "fabric")
 _FLOORS = ("planks", "parquet", "tiles", "checker", "carpet", "brick", "marble", "wicker")

@@ -39,6 +39,8 @@ _TRIES = 4
 _CANDIDATES, _CHOSEN = 5, 0.75
 """Of so many cameras the one that promises most objects is taken, this often; else the first."""
 _PROMISING_M = (0.8, 7.0)
+_HEIGHT_M, _PITCH_DEG, _FIELD_DEG = (0.3, 0.75), (0.0, 20.0), (70.0, 95.0)
+"""Of a camera: height, how far its nose is down, field of view across."""
 _CLEARANCE_M, _RASTER_M = 0.3, 0.05
 _VARIANTS = {"standard": 0.6, "rooms": 0.15, "plain": 0.1, "repeating": 0.05, "symmetric": 0.05, "person": 0.05}
 """Kinds of homes, and how often each is drawn."""
@@ -128,7 +130,7 @@ def _agree(out: Path, recipe: ViewRecipe) -> None:
     plan: dict[str, Any] = {"format": "semslam views", "recipe": asdict(recipe), "versions": versions()}
     path = out / _PLAN
     if path.is_file():
-        stored = json.loads(path.read_text())
+        stored = _stored(path)
         was, now = ({**p["recipe"], "homes": 0} | p["versions"] for p in (stored, plan))
         differing = sorted(name for name in {*was, *now} if was.get(name) != now.get(name))
         if differing:
@@ -139,6 +141,21 @@ def _agree(out: Path, recipe: ViewRecipe) -> None:
     temporary = out / f".{_PLAN}.partial-{os.getpid()}"
     temporary.write_text(json.dumps(plan, indent=1, sort_keys=True) + "\n")
     temporary.replace(path)
+
+
+def _stored(path: Path) -> dict[str, Any]:
+    """The plan of a folder.
+
+    Raises:
+        SemslamError: it is damaged, or not of views.
+    """
+    try:
+        plan = json.loads(path.read_text())
+        if isinstance(plan, dict) and isinstance(plan["recipe"], dict) and isinstance(plan["versions"], dict):
+            return plan
+    except (OSError, ValueError, KeyError):
+        pass
+    raise SemslamError(f"`{path}` is not the plan of a set of views", hint="give another folder")
 
 
 @dataclass(frozen=True)
@@ -222,15 +239,18 @@ def _looks(home: Home, views: int, rng: np.random.Generator, *, unfamiliar: bool
 def _lens(rng: np.random.Generator, *, unfamiliar: bool) -> Camera:
     """A pinhole of 70 to 95 degrees across; a narrower one if unfamiliar."""
     from semslam.geometry.camera import Camera
+    from semslam.sim import unfamiliar as strange
 
-    low, high = (55.0, 65.0) if unfamiliar else (70.0, 95.0)
+    low, high = strange.FIELD_DEG if unfamiliar else _FIELD_DEG
     focal = WIDTH / 2 / math.tan(math.radians(rng.uniform(low, high)) / 2)
     return Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 
 
 def _stand(rng: np.random.Generator, *, unfamiliar: bool) -> tuple[float, float]:
     """Height of the camera, metres, and how far its nose is down, radians."""
-    height, pitch = ((0.9, 1.3), (10.0, 25.0)) if unfamiliar else ((0.3, 0.75), (0.0, 20.0))
+    from semslam.sim import unfamiliar as strange
+
+    height, pitch = (strange.HEIGHT_M, strange.PITCH_DEG) if unfamiliar else (_HEIGHT_M, _PITCH_DEG)
     return float(rng.uniform(*height)), math.radians(rng.uniform(*pitch))
 
 

@@ -33,7 +33,7 @@ INGEST = Stage(
 )
 EXTRACT = Stage(
     "extract",
-    version=1,
+    version=2,
     config=ExtractConfig,
     reads=(FRAMES,),
     writes=(DETECTIONS, OBSERVATIONS),

@@ -125,7 +125,9 @@ class Frame:
     rgb: NDArray[np.uint8]
     """(H, W, 3)"""
     depth_m: NDArray[np.float32]
-    """(H, W), 0 where missing or out of range."""
+    """(H, W), 0 where missing; as measured, for networks know what to make of what is far."""
+    in_range: NDArray[np.bool_]
+    """(H, W) where depth is there and near enough to be projected."""
     landing: Landing
 
 
@@ -309,7 +311,7 @@ def _shapes(frame: Frame, masks: NDArray[np.bool_]) -> Columns:
 def _usable_points(frame: Frame, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Points (n, 3) of the pixels of a mask that have depth."""
     near = window(mask)
-    usable = mask[near] & (frame.depth_m[near] > 0)
+    usable = mask[near] & frame.in_range[near]
     return np.stack([axis[usable] for axis in np.moveaxis(frame.landing.points[near], -1, 0)]).T
 
 
@@ -363,18 +365,18 @@ def _groups(rows: Iterator[Row], config: ExtractConfig) -> Iterator[list[Frame]]
 def _frame(row: Row, config: ExtractConfig) -> Frame:
     """A keyframe with its pictures decoded and its pixels on the ground; depth out of range counts as missing."""
     rgb, depth_m = decode_colour(row.pop("colour")), decode_depth(row.pop("depth"))
-    depth_m *= (depth_m >= config.min_depth_m) & (depth_m <= config.max_depth_m)
+    in_range = (depth_m >= config.min_depth_m) & (depth_m <= config.max_depth_m)
     robot_from_camera = np.array(row["robot_from_camera"]).reshape(4, 4)
-    points = points_in_robot(depth_m, row["fx"], row["fy"], row["cx"], row["cy"], robot_from_camera)
+    points = points_in_robot(depth_m * in_range, row["fx"], row["fy"], row["cx"], row["cy"], robot_from_camera)
     landing = land(
         points,
-        depth_m > 0,
+        in_range & (depth_m > 0),
         cell_m=config.cell_m,
         side=config.side,
         floor_tolerance_m=config.floor_tolerance_m,
         max_height_m=config.max_height_m,
     )
-    return Frame(row, rgb, depth_m, landing)
+    return Frame(row, rgb, depth_m, in_range & (depth_m > 0), landing)
 
 
 def _count(shard: ShardWriter, seen: Seen) -> None:

@@ -107,8 +107,8 @@ class ExtractConfig:
     shard_frames: int = setting(100, low=1, high=100000)
     """Keyframes a shard: what a killed run loses at most."""
     batch: int = setting(1, low=1, high=16)
-    """Keyframes that the detector sees at once, if its file leaves the batch size open. No result depends on it. More
-    than one gains nothing on a processor, only on a GPU, and each costs about 40 MB at 640 x 480."""
+    """Keyframes that the detector sees at once, if its file leaves the batch size open. More than one gains something
+    on a GPU alone, and each costs about 40 MB at 640 x 480. On a processor no result depends on it."""
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ class ClassMap:
             classes, certainty, unsound = _most_likely(np.asarray(answer, np.float32), _picture_size(signature))
         found = list(_pieces(classes, certainty, look))
         found.sort(key=lambda piece: -piece.score)
-        return _detections(found[:MOST_OBJECTS], unsound, look.box)
+        return _detections(found[:MOST_OBJECTS], int(unsound > 0), look.box)
 
     def classes(self, signature: Signature) -> tuple[int, ...]:
         """Number of classes; a map of numbers does not tell."""
@@ -128,7 +128,7 @@ def _most_likely(logits: Floats, size: tuple[int, int]) -> tuple[Map, Floats, in
     if logits.shape[1] * _FINE < size[0]:
         finer = (size[1] // _FINE, size[0] // _FINE)
         logits = np.stack([_resized(np.asarray(plane, np.float32), finer, cv2.INTER_LINEAR) for plane in logits])
-        sound = _resized(np.asarray(sound, np.float32), finer, cv2.INTER_NEAREST) > 0
+        sound = _resized(np.asarray(sound, np.float32), finer, cv2.INTER_NEAREST_EXACT) > 0
     classes = logits.argmax(axis=0)
     top = np.take_along_axis(logits, classes[None], axis=0)
     certainty = 1 / np.exp(logits - top).sum(axis=0)
@@ -149,7 +149,7 @@ def _pieces(classes: Map, certainty: Floats | None, look: Look) -> Iterator[_Pie
     height, width = classes.shape
     steps = np.zeros((height, width), bool)
     if look.depth_m is not None:
-        steps = depth_steps(_resized(look.depth_m, (width, height), cv2.INTER_NEAREST))
+        steps = depth_steps(_resized(look.depth_m, (width, height), cv2.INTER_NEAREST_EXACT))
     smallest = max(4, round(_MIN_SHARE * classes.size))
     counts = np.bincount(classes.ravel())[:_NO_CLASS]
     for class_id in np.flatnonzero(counts >= smallest).tolist():
@@ -159,7 +159,7 @@ def _pieces(classes: Map, certainty: Floats | None, look: Look) -> Iterator[_Pie
             score = 1.0 if certainty is None else float(certainty[mask].mean())
             if score >= look.min_score:
                 whole = cv2.resize(
-                    mask.astype(np.uint8), (look.box.width, look.box.height), interpolation=cv2.INTER_NEAREST
+                    mask.astype(np.uint8), (look.box.width, look.box.height), interpolation=cv2.INTER_NEAREST_EXACT
                 )
                 yield _Piece(class_id, score, whole > 0)
 

@@ -23,6 +23,8 @@ from semslam.models.session import Session, Signature, open_session
 
 TASK = "prompted-segmentation"
 """What the metadata's `task` says of both files."""
+_AT_ONCE = 32
+"""Boxes in one run of the decoder, which bounds its memory."""
 _NO_LOGIT = -1.0
 """In the place of logits that are no numbers: not the object."""
 
@@ -73,12 +75,13 @@ class PromptedSegmenter:
     def _logits(self, rgb: NDArray[np.uint8], depth_m: Floats, boxes: Floats) -> Floats:
         """(N, m, m) of boxes (N, 4) in pixels of the picture."""
         canvas, box = fit(rgb, self.width, self.height)
-        known = np.isfinite(depth_m) & (depth_m > 0)
-        depth = fit_depth(np.where(known, depth_m, np.float32(0)), box, self.width, self.height)
+        depth = fit_depth(depth_m, box, self.width, self.height)
         features = self.encoder.run({"images": planes(canvas, UNIT), "depth": depth[None, None]})[0]
         scale = np.array([box.scale_x, box.scale_y] * 2, np.float32)
         prompts = boxes * scale + np.array([box.left, box.top] * 2, np.float32)
-        logits = np.asarray(self.decoder.run({"features": features, "boxes": prompts})[0], np.float32)
+        groups = [prompts[start : start + _AT_ONCE] for start in range(0, len(prompts), _AT_ONCE)]
+        runs = [self.decoder.run({"features": features, "boxes": group})[0] for group in groups]
+        logits = np.concatenate(runs).astype(np.float32, copy=False)
         if logits.ndim != 3 or len(logits) != len(boxes):
             raise SemslamError(
                 f"Segmenter decoder `{self.decoder.path}` answers {len(boxes)} boxes with {list(logits.shape)}",

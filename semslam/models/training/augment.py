@@ -67,9 +67,8 @@ def moved(picture: Picture, rng: Rng, strength: float) -> Picture:
 def _warped(picture: Picture, matrix: NDArray[np.float64], zoom: float) -> Picture:
     height, width = picture.instances.shape
     size = (width, height)
-    method = cv2.INTER_LINEAR if zoom >= 0.8 else cv2.INTER_AREA
     grey = (114, 114, 114)
-    rgb = cv2.warpAffine(picture.rgb, matrix, size, flags=method, borderValue=grey)
+    rgb = cv2.warpAffine(picture.rgb, matrix, size, flags=cv2.INTER_LINEAR, borderValue=grey)
     depth = cv2.warpAffine(picture.depth_m, matrix, size, flags=cv2.INTER_NEAREST, borderValue=0)
     instances = cv2.warpAffine(picture.instances, matrix, size, flags=cv2.INTER_NEAREST, borderValue=0)
     objects = [found for item in picture.objects if (found := _moved(item, matrix, zoom, width, height))]
@@ -82,11 +81,14 @@ def _warped(picture: Picture, matrix: NDArray[np.float64], zoom: float) -> Pictu
 
 
 def _fitted(item: SeenObject, instances: NDArray[np.uint16]) -> SeenObject:
-    """An object that was cut, with the box of what is left of it."""
-    left, top, width, height = cv2.boundingRect((instances == item.instance).astype(np.uint8))
-    if width * height == 0:
-        return replace(item, pixels=0)
-    return replace(item, left=left, top=top, right=left + width, bottom=top + height)
+    """An object that was cut, with box, pixels and share of what is really left of it."""
+    mask = (instances == item.instance).astype(np.uint8)
+    pixels = int(np.count_nonzero(mask))
+    if pixels == 0:
+        return replace(item, pixels=0, share=0.0)
+    left, top, width, height = cv2.boundingRect(mask)
+    share = min(1.0, item.share * pixels / max(1, item.pixels))
+    return replace(item, left=left, top=top, right=left + width, bottom=top + height, pixels=pixels, share=share)
 
 
 def _moved(item: SeenObject, matrix: NDArray[np.float64], zoom: float, width: int, height: int) -> SeenObject | None:
@@ -110,7 +112,7 @@ def pasted(picture: Picture, other: Picture, rng: Rng) -> Picture:
         return picture
     rng.shuffle(chosen)
     rgb, depth, instances = picture.rgb.copy(), picture.depth_m.copy(), picture.instances.copy()
-    first = int(max((item.instance for item in picture.objects), default=0)) + 1
+    first = int(picture.instances.max(initial=0)) + 1  # slivers and people have ids without being objects
     candidates = list(picture.objects)
     for index, item in enumerate(chosen[:4]):
         mask = other.instances == item.instance

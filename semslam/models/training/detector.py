@@ -32,11 +32,19 @@ _RARE_CLASS = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Examples:
-    """Truth of one picture: boxes (N, 4) left, top, right, bottom in pixels, class ids (N,), boxes to ignore (M, 4)."""
+    """Truth of one picture: boxes (N, 4) left, top, right, bottom in pixels, class ids (N,); and what to ignore."""
 
     boxes: Tensor
     classes: Tensor
     ignored: Tensor
+    """(M, 4)"""
+    ignored_classes: Tensor
+    """(M,)"""
+
+    def to(self, device: torch.device) -> Examples:
+        """The same on a device."""
+        parts = (self.boxes, self.classes, self.ignored, self.ignored_classes)
+        return Examples(*(part.to(device) for part in parts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +59,7 @@ class Batch:
 
     def to(self, device: torch.device) -> Batch:
         """The batch on a device."""
-        truth = [Examples(one.boxes.to(device), one.classes.to(device), one.ignored.to(device)) for one in self.truth]
-        return Batch(self.images.to(device), self.depth_m.to(device), truth)
+        return Batch(self.images.to(device), self.depth_m.to(device), [one.to(device) for one in self.truth])
 
 
 @dataclass(eq=False)
@@ -71,7 +78,8 @@ class Batches:
     @staticmethod
     def of(pictures: PictureSet, *, steps: int, batch: int, seed: int, strength: Strength | None = None) -> Batches:
         """Decode all pictures, small enough to keep."""
-        kept = [_compact(resized(picture, INPUT_WIDTH, INPUT_HEIGHT)) for picture in _each(pictures)]
+        size = INPUT_WIDTH, INPUT_HEIGHT
+        kept = [_compact(resized(pictures[index], *size)) for index in range(len(pictures))]
         return Batches(kept, _weights(pictures), steps, batch, seed, strength or Strength())
 
     def __call__(self, step: int) -> Batch:
@@ -98,7 +106,9 @@ def collated(pictures: Sequence[Picture]) -> Batch:
     images = np.stack([picture.rgb for picture in pictures]).astype(np.float32) * np.float32(1 / 255)
     depth = np.stack([picture.depth_m for picture in pictures])[:, None]
     tensor = torch.from_numpy(images).permute(0, 3, 1, 2)  # channels last in memory, as the network wants them
-    truth = [Examples(_boxes(p.counting), _classes(p.counting), _boxes(p.glimpses)) for p in pictures]
+    truth = [
+        Examples(_boxes(p.counting), _classes(p.counting), _boxes(p.glimpses), _classes(p.glimpses)) for p in pictures
+    ]
     return Batch(tensor, torch.from_numpy(depth), truth)
 
 
@@ -111,12 +121,8 @@ def _classes(objects: Sequence[SeenObject]) -> Tensor:
     return torch.tensor([item.class_id for item in objects], dtype=torch.int64)
 
 
-def _each(pictures: PictureSet) -> list[Picture]:
-    return [pictures[index] for index in range(len(pictures))]
-
-
 def _compact(picture: Picture) -> Picture:
-    """With depth as halves: millimetres to 4 m, and half the memory."""
+    """With depth as halves, in steps of 2 mm at 2 to 4 m, for half the memory."""
     return Picture(picture.rgb, picture.depth_m.astype(np.float16), picture.instances, picture.objects)
 
 
@@ -147,8 +153,8 @@ def detection_loss(network: nn.Module, batch: Batch) -> tuple[Tensor, Mapping[st
     wanted, goal, used = (torch.stack([target[part] for target in targets]) for part in range(3))
     weight = wanted.sum(-1)  # (B, cells)
     total = weight.sum().clamp(min=1)
-    entropy = F.binary_cross_entropy_with_logits(logits, wanted, reduction="none").sum(-1)
-    classification = (entropy * used).sum() / total
+    entropy = F.binary_cross_entropy_with_logits(logits, wanted, reduction="none") * used
+    classification = entropy.sum() / total
     chosen = weight > 0
     regression = ((1 - generalised_iou(boxes[chosen], goal[chosen])) * weight[chosen]).sum() / total
     parts = {"classes": float(classification.detach()), "boxes": float(regression.detach())}
@@ -163,14 +169,14 @@ def _cells(width: int, height: int) -> tuple[Tensor, Tensor]:
 def assign(
     boxes: Tensor, scores: Tensor, centres: Tensor, strides: Tensor, truth: Examples
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Which cell answers for which object: soft class targets (cells, classes), boxes (cells, 4), cells that count.
+    """Which cell answers for which object: targets (cells, classes), boxes (cells, 4), what counts (cells, classes).
 
     Each object takes the ten cells inside it whose answer is best, score^0.5 * IoU^4; a cell wanted by several goes
-    to the one it overlaps most. Cells on objects too small or hidden to count are left out of the loss.
+    to the one it overlaps most. On objects too small or hidden to count, their own class is left out of the loss.
     """
-    wanted, goal, used = torch.zeros_like(scores), torch.zeros_like(boxes), torch.ones_like(strides)
-    if len(truth.ignored):
-        used[_inside(centres, truth.ignored).any(0)] = 0
+    wanted, goal, used = torch.zeros_like(scores), torch.zeros_like(boxes), torch.ones_like(scores)
+    for inside, class_id in zip(_inside(centres, truth.ignored), truth.ignored_classes.tolist(), strict=True):
+        used[inside, class_id] = 0
     if not len(truth.boxes):
         return wanted, goal, used
     overlap = pairwise_iou(truth.boxes, boxes).clamp(min=1e-6)  # (G, cells)

@@ -1,4 +1,4 @@
-"""What a finished model is worth on views that it has not seen, through the same code that extract runs."""
+"""What a finished model is worth on views that it has not seen, through the adapters and segmenters of extract."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from semslam.errors import SemslamError
 from semslam.models.detectors import Detections, Detector
 from semslam.models.segmenters import open_segmenter
 from semslam.models.training.pictures import PictureSet
@@ -24,6 +25,12 @@ _FAINTEST, _MAX_OVERLAP = 0.01, 0.5
 def judged_detector(model: Path, views: PictureSet) -> BoxScores:
     """Average precision of an exported detector on views."""
     detector = Detector.open(model)
+    if detector.class_names != views.class_names:
+        raise SemslamError(
+            f"`{model}` and the views it is to be judged on have different classes",
+            details=f"{', '.join(detector.class_names)}\n{', '.join(views.class_names)}",
+            hint="judge it on views of the classes it was trained on",
+        )
     truth, found = [], list[Detections]()
     for index in range(len(views)):
         picture = views[index]
@@ -49,12 +56,14 @@ def judged_segmenter(encoder: Path, decoder: Path, views: PictureSet) -> MaskSco
 
 def box_table(scores: BoxScores) -> str:
     """Markdown, a class a line."""
-    head = "| class | objects | AP at 0.5 | AP at 0.5 to 0.95 |\n|---|---|---|---|\n"
+    head = "| class | objects | lesser glimpses, ignored | AP at 0.5 | AP at 0.5 to 0.95 |\n|---|---|---|---|---|\n"
+    columns = (scores.class_names, scores.objects, scores.ignored, scores.ap50, scores.ap50_95)
     rows = [
-        f"| {name} | {count} | {_shown(low)} | {_shown(mean)} |"
-        for name, count, low, mean in zip(scores.class_names, scores.objects, scores.ap50, scores.ap50_95, strict=True)
+        f"| {name} | {count} | {ignored} | {_shown(low)} | {_shown(mean)} |"
+        for name, count, ignored, low, mean in zip(*columns, strict=True)
     ]
-    total = f"| **all** | {sum(scores.objects)} | **{_shown(scores.map50)}** | **{_shown(scores.map50_95)}** |"
+    counts = f"{sum(scores.objects)} | {sum(scores.ignored)}"
+    total = f"| **all** | {counts} | **{_shown(scores.map50)}** | **{_shown(scores.map50_95)}** |"
     return head + "\n".join([*rows, total])
 
 

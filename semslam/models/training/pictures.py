@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semslam.errors import SemslamError
+from semslam.models.detections import shrinking
+from semslam.models.onnxfile import file_digest
 from semslam.tables.parquet import TableFiles
 from semslam.tables.pictures import decode_colour, decode_depth
 from semslam.tables.spec import VIEWS
@@ -88,7 +90,9 @@ class PictureSet:
     class_names: tuple[str, ...]
     rows: Sequence[dict[str, Any]]
     digest: str
-    """Of names and sizes of the files: another set has another one."""
+    """Of names and content of the files."""
+    homes: tuple[str, ...] = ()
+    """Names of the files."""
     origin: str = ""
     """The command that made it, as far as the folder tells."""
 
@@ -109,7 +113,9 @@ class PictureSet:
                 f"Files in `{folder}` disagree about the classes", hint="keep each set in its own folder"
             )
         rows = [row for file in files for row in _rows(file)]
-        return PictureSet(names.pop(), rows, _fingerprint(paths), _origin(folder, len(paths)))
+        return PictureSet(
+            names.pop(), rows, _fingerprint(paths), tuple(path.stem for path in paths), _origin(folder, len(paths))
+        )
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -124,17 +130,16 @@ class PictureSet:
 
 
 def resized(picture: Picture, width: int, height: int) -> Picture:
-    """The picture at another size; the objects' boxes and pixels scale with it."""
+    """The picture at another size, resampled as at run time; the objects' boxes and pixels scale with it."""
     rows, columns = picture.instances.shape
     if (rows, columns) == (height, width):
         return picture
     across, down = width / columns, height / rows
     size = (width, height)
-    area = cv2.INTER_AREA if across < 1 else cv2.INTER_LINEAR
     return Picture(
-        np.asarray(cv2.resize(picture.rgb, size, interpolation=area), np.uint8),
-        np.asarray(cv2.resize(picture.depth_m, size, interpolation=cv2.INTER_NEAREST), np.float32),
-        np.asarray(cv2.resize(picture.instances, size, interpolation=cv2.INTER_NEAREST), np.uint16),
+        np.asarray(cv2.resize(picture.rgb, size, interpolation=shrinking(min(across, down))), np.uint8),
+        np.asarray(cv2.resize(picture.depth_m, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32),
+        np.asarray(cv2.resize(picture.instances, size, interpolation=cv2.INTER_NEAREST_EXACT), np.uint16),
         tuple(_scaled(item, across, down) for item in picture.objects),
     )
 
@@ -169,12 +174,16 @@ def _origin(folder: Path, homes: int) -> str:
     try:
         recipe = json.loads((folder / "plan.json").read_text())["recipe"]
         unfamiliar = " --unfamiliar" if recipe["unfamiliar"] else ""
-        made = f"--homes {homes} --views {recipe['views']} --seed {recipe['seed']}{unfamiliar}"
+        wanted = int(recipe["homes"])
+        made = f"--homes {wanted} --views {recipe['views']} --seed {recipe['seed']}{unfamiliar}"
     except (OSError, ValueError, KeyError, TypeError):
         return folder.name
-    return f"semslam train pictures {folder.name} {made}"
+    missing = f" ({homes} of them)" if homes != wanted else ""
+    return f"semslam train pictures {folder.name} {made}{missing}"
 
 
 def _fingerprint(paths: Sequence[Path]) -> str:
-    text = "\n".join(f"{path.name} {path.stat().st_size}" for path in paths)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    digest = hashlib.sha256()
+    for path in paths:
+        digest.update(f"{path.name} {file_digest(path)}\n".encode())
+    return digest.hexdigest()[:16]

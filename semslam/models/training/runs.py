@@ -91,6 +91,7 @@ def train_detector(run: Run) -> list[Path]:
     """
     device = prepare(run)
     pictures = PictureSet.open(run.data)
+    unseen = _unseen(run, pictures)
     network = new_detector(pictures.class_names, run.schedule.seed)
     network = network.to(device=device, memory_format=torch.channels_last)
     batches = Batches.of(pictures, steps=run.schedule.steps, batch=run.schedule.batch, seed=run.schedule.seed)
@@ -98,14 +99,14 @@ def train_detector(run: Run) -> list[Path]:
     trained = fit(network, detection_loss, batches, run.schedule, run.out, facts=facts, watch=run.watch)
     path = run.out / DETECTOR
     export_detector(trained, path, pictures.class_names)
-    tables = [box_table(judged_detector(path, PictureSet.open(run.test)))] if run.test else []
+    table = box_table(judged_detector(path, unseen)) if unseen else ""
     facts = {
         "input": f"`images` (N, 3, {INPUT_HEIGHT}, {INPUT_WIDTH}) RGB 0 to 1, `depth` (N, 1, same) metres, 0 missing",
         "output": "`output0` (N, 4 + classes, cells), YOLOv8's layout, boxes in input pixels",
         "classes": ", ".join(pictures.class_names),
-        **_made(run, network, pictures),
+        **_made(run, device, network, pictures),
     }
-    write_card(path, "Object detector from colour and depth", _ON_HOMES, facts, _judged_on(run, tables))
+    write_card(path, "Object detector from colour and depth", _ON_HOMES, facts, _judged(unseen, table))
     return [path, path.with_suffix(".md")]
 
 
@@ -117,20 +118,21 @@ def train_segmenter(run: Run) -> list[Path]:
     """
     device = prepare(run)
     pictures = PictureSet.open(run.data)
+    unseen = _unseen(run, pictures)
     network = new_segmenter(run.schedule.seed)
     network = network.to(device=device, memory_format=torch.channels_last)
     batches = PromptBatches.of(pictures, steps=run.schedule.steps, batch=run.schedule.batch, seed=run.schedule.seed)
     facts = {"task": "segmenter", "data": pictures.digest}
     trained = fit(network, mask_loss, batches, run.schedule, run.out, facts=facts, watch=run.watch)
     encoder, decoder = export_segmenter(_segmenter(trained), run.out)
-    tables = [mask_table(judged_segmenter(encoder, decoder, PictureSet.open(run.test)))] if run.test else []
+    table = mask_table(judged_segmenter(encoder, decoder, unseen)) if unseen else ""
     described = {
         "input": "`images` (1, 3, h, w) RGB 0 to 1, `depth` (1, 1, h, w) metres; then `features` and `boxes` (N, 4)",
         "output": "`masks` (N, m, m) logits on a grid over each box and its margin (metadata `box_margin`)",
         "decoder": f"{decoder.name}, SHA-256 `{file_digest(decoder)}`",
-        **_made(run, network, pictures),
+        **_made(run, device, network, pictures),
     }
-    write_card(encoder, "Box-prompted segmenter of colour and depth", _ON_HOMES, described, _judged_on(run, tables))
+    write_card(encoder, "Box-prompted segmenter of colour and depth", _ON_HOMES, described, _judged(unseen, table))
     return [encoder, decoder, encoder.with_suffix(".md")]
 
 
@@ -158,26 +160,43 @@ _ON_HOMES = (
 )
 
 
-def _made(run: Run, network: nn.Module, pictures: PictureSet) -> dict[str, Any]:
+def _made(run: Run, device: torch.device, network: nn.Module, pictures: PictureSet) -> dict[str, Any]:
     """How a model came about, for its card."""
     schedule = run.schedule
     return {
         "parameters": f"{parameters_of(network):,}",
         "data": f"{len(pictures):,} views, `{pictures.origin}`, digest {pictures.digest}",
-        "command": f"`{run.command}`",
+        "command": f"`{run.command} --device {device.type}`",
         "seed": schedule.seed,
         "steps": f"{schedule.steps:,} of {schedule.batch} views",
         "licence": "Apache-2.0, model and data",
     }
 
 
-def _judged_on(run: Run, tables: Sequence[str]) -> list[str]:
-    if not run.test:
+def _unseen(run: Run, pictures: PictureSet) -> PictureSet | None:
+    """The views to judge on, opened before the work of hours begins.
+
+    Raises:
+        SemslamError: no views there, other classes, or homes that are trained on.
+    """
+    if run.test is None:
+        return None
+    unseen = PictureSet.open(run.test)
+    shared = sorted({*pictures.homes} & {*unseen.homes})
+    if shared:
+        raise SemslamError(
+            f"{len(shared)} homes of `{run.test}` are in `{run.data}` too, such as `{shared[0]}`",
+            hint="judge on other homes: `semslam train pictures` with another `--seed`",
+        )
+    if unseen.class_names != pictures.class_names:
+        raise SemslamError(f"`{run.test}` has other classes than `{run.data}`", hint="judge on views of the same kind")
+    return unseen
+
+
+def _judged(unseen: PictureSet | None, table: str) -> list[str]:
+    if unseen is None:
         return ["Not judged: `--test VIEWS` was not given."]
-    text = (
-        f"On {len(PictureSet.open(run.test)):,} views of homes it has not seen (`{run.test.name}`), objects that count:"
-    )
-    return [text, *tables]
+    return [f"On {len(unseen):,} views of homes it has not seen (`{unseen.origin}`), objects that count:", table]
 
 
 def exported_detector(out: Path, run: Path | None, seed: int | None, classes: Path | None) -> list[Path]:
@@ -223,7 +242,7 @@ def trained_detector(folder: Path) -> tuple[Detector, tuple[str, ...]]:
     Raises:
         SemslamError: no checkpoint there, or one of another network.
     """
-    names = tuple(read_checkpoint(folder / CHECKPOINT)["run"].get("classes", ()))
+    names = tuple(_stored(folder, "detector")["run"]["classes"])
     network = new_detector(names, 0)
     network.load_state_dict(_averaged(folder, "detector", network))
     return network.eval(), names
@@ -231,12 +250,22 @@ def trained_detector(folder: Path) -> tuple[Detector, tuple[str, ...]]:
 
 def _averaged(folder: Path, task: str, network: nn.Module) -> Mapping[str, Any]:
     """Averaged weights of a run of this task; `network` tells their shapes."""
+    average = torch.optim.swa_utils.AveragedModel(network, use_buffers=True)
+    try:
+        average.load_state_dict(_stored(folder, task)["average"])
+    except RuntimeError as error:
+        raise SemslamError(
+            f"The checkpoint in `{folder}` is of a network of another shape", hint="export it with the version it is of"
+        ) from error
+    return average.module.state_dict()
+
+
+def _stored(folder: Path, task: str) -> dict[str, Any]:
+    """The checkpoint of a run of this task."""
     stored = read_checkpoint(folder / CHECKPOINT)
     if stored["run"].get("task") != task:
         raise SemslamError(f"`{folder}` is not the run of a {task}", hint=f"name that of `semslam train {task}`")
-    average = torch.optim.swa_utils.AveragedModel(network, use_buffers=True)
-    average.load_state_dict(stored["average"])
-    return average.module.state_dict()
+    return stored
 
 
 def export_detector(network: nn.Module, path: Path, class_names: Sequence[str]) -> None:

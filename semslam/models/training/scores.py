@@ -47,6 +47,8 @@ class BoxScores:
     """Mean over overlaps of 0.5 to 0.95 in steps of 0.05."""
     objects: tuple[int, ...]
     """Objects that count."""
+    ignored: tuple[int, ...] = ()
+    """Objects that do not."""
 
     @property
     def map50(self) -> float | None:
@@ -194,6 +196,7 @@ def average_precision(
         tuple(float(precision[0, :, k].mean()) if n else None for k, n in enumerate(counts)),
         tuple(float(precision[:, :, k].mean()) if n else None for k, n in enumerate(counts)),
         tuple(counts),
+        tuple(sum(not w.counts and w.class_id == k for o in truth for w in o) for k in range(len(class_names))),
     )
 
 

@@ -48,7 +48,9 @@ class Schedule:
     average: float = 0.998
     """Weight of the past in the moving average of the weights; that average is what is kept."""
     checkpoint_s: float = 60.0
-    """Seconds of work that a kill may cost."""
+    """Seconds after which the next report saves a checkpoint."""
+    report_every: int = 50
+    """Steps between reports."""
 
     def rate(self, step: int) -> float:
         """Learning rate of a step, from 0."""
@@ -78,7 +80,6 @@ def fit(
     *,
     facts: Mapping[str, Any],
     watch: Callable[[Progress], None] | None = None,
-    report_every: int = 50,
 ) -> nn.Module:
     """Train a network, or go on where a killed run was, and return the average of its weights, in evaluation mode.
 
@@ -89,7 +90,7 @@ def fit(
         schedule: how long and how fast.
         folder: gets `checkpoint.pt` and `curves.csv` (step, rate, losses).
         facts: what the run depends on (data, sizes); a checkpoint of other facts is refused.
-        watch: hears of the progress every `report_every` steps.
+        watch: hears of the progress at every report.
 
     Raises:
         SemslamError: the folder holds a checkpoint of another run, or the loss is no number.
@@ -97,6 +98,7 @@ def fit(
     folder.mkdir(parents=True, exist_ok=True)
     run = {**asdict(schedule), **facts}
     run.pop("checkpoint_s")
+    run.pop("report_every")
     state = _State.start(network, schedule)
     first = state.resume(folder / CHECKPOINT, run)
     curves = _Curves(folder / _CURVES, first)
@@ -108,15 +110,16 @@ def fit(
         for name, number in {"loss": float(value.detach()), **parts}.items():
             sums[name] = sums.get(name, 0.0) + number
         counted += 1
-        if (step + 1) % report_every == 0 or step + 1 == schedule.steps:
+        last = step + 1 == schedule.steps
+        if (step + 1) % schedule.report_every == 0 or last:
             means = {name: total / counted for name, total in sums.items()}
             curves.add(step + 1, schedule.rate(step), means)
             if watch:
                 watch(Progress(step + 1, schedule.steps, means, counted / (time.monotonic() - since)))
             sums, counted, since = {}, 0, time.monotonic()
-        if time.monotonic() - saved > schedule.checkpoint_s or step + 1 == schedule.steps:
-            state.save(folder / CHECKPOINT, run, step + 1)
-            saved = time.monotonic()
+            if last or time.monotonic() - saved > schedule.checkpoint_s:
+                state.save(folder / CHECKPOINT, run, step + 1)
+                saved = time.monotonic()
     trained: nn.Module = state.average.module
     return trained.eval()
 
@@ -161,14 +164,14 @@ class _State:
 
     def step(self, value: Tensor, rate: float, step: int) -> None:
         if not torch.isfinite(value):
-            raise SemslamError(
-                f"The loss of step {step} is {float(value)}", hint="lower the rate: `--rate`, or look at the data"
-            )
+            raise _diverged(f"loss of step {step}", value.item())
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
         value.backward()
-        nn.utils.clip_grad_norm_(self.network.parameters(), _CLIP)
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), _CLIP)
+        if not torch.isfinite(norm):  # weights would be spoilt, and the next checkpoint with them
+            raise _diverged(f"gradient of step {step}", norm.item())
         self.optimizer.step()
         self.average.update_parameters(self.network)
 
@@ -202,6 +205,11 @@ class _State:
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def _diverged(what: str, value: float) -> SemslamError:
+    hint = "begin again with a lower `--rate` in another `--out`, or look at the data"
+    return SemslamError(f"The {what} is {value}", hint=hint)
 
 
 class _Curves:
