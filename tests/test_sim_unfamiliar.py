@@ -108,8 +108,8 @@ def test_the_camera_is_higher_more_inclined_and_narrower_than_in_training() -> N
     for seed in range(20):
         robot, lens = unfamiliar_camera(np.random.default_rng(seed), 320, 240)
         assert 0.9 <= robot.camera_height_m <= 1.3
-        assert 10 <= math.degrees(robot.camera_pitch_rad) <= 25
-        assert 55 <= 2 * math.degrees(math.atan(160 / lens.fx)) <= 65
+        assert 20 <= math.degrees(robot.camera_pitch_rad) <= 30
+        assert 40 <= 2 * math.degrees(math.atan(160 / lens.fx)) <= 47
         assert (lens.width, lens.height, lens.fx, lens.cx, lens.cy) == (320, 240, lens.fy, 159.5, 119.5)
 
 
