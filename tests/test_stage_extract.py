@@ -24,6 +24,7 @@ from semslam.models.session import Session
 from semslam.pipeline.config import file_settings, load_config
 from semslam.pipeline.job import Outcome
 from semslam.stages.catalogue import EXTRACT, INGEST, STAGES
+from semslam.stages.extract import ObjectClasses
 from semslam.stages.settings import ExtractConfig, IngestConfig
 from semslam.tables.pictures import decode_colour
 from semslam.tables.spec import DETECTIONS, FRAMES, OBSERVATIONS
@@ -417,3 +418,13 @@ def test_looking_ahead_changes_nothing() -> None:
         got.extend(ahead(groups()))
     assert got == [[1], [2, 3]]
     assert list(ahead(iter([]))) == []
+
+
+@pytest.mark.parametrize("name", ["unobserved", "free_floor", "", "two\nlines"])
+def test_a_detector_s_class_may_not_have_a_reserved_or_unprintable_name(name: str) -> None:
+    """It would be taken for something else; renamed or left out, it is no trouble."""
+    with pytest.raises(SemslamError, match="no object class may have") as caught:
+        ObjectClasses.choose([name, "chair"], ExtractConfig())
+    assert "remap" in (caught.value.hint or "")
+    assert ObjectClasses.choose([name, "chair"], ExtractConfig(remap={name: "thing"})).all[-2:] == ("thing", "chair")
+    assert ObjectClasses.choose([name, "chair"], ExtractConfig(exclude=(name,))).all[-1] == "chair"

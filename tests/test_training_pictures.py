@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import pytest
 from semslam.errors import SemslamError
 from semslam.models.training.augment import Strength, moved, pasted, photographed, randomised, recoloured
 from semslam.models.training.pictures import Picture, PictureSet, SeenObject, resized
+from semslam.tables.parquet import TableFiles, write_table
+from semslam.tables.spec import VIEWS
 from tests.views_factory import NAMES, box_picture, write_views
 
 
@@ -149,3 +152,63 @@ def test_masks_shrink_about_their_middle(size: tuple[int, int]) -> None:
     picture = resized(box_picture(5, width=640, height=480, objects=2), *size)
     for item in picture.objects:
         np.testing.assert_allclose(box_of(picture, item), (item.left, item.top, item.right, item.bottom), atol=0.51)
+
+
+def spoil(folder: Path, column: str, value: Any, meta: dict[str, Any] | None = None) -> None:
+    """Write the first home's views again with another value in the first row of a column."""
+    path = sorted(folder.glob("*.parquet"))[0]
+    file = TableFiles(VIEWS, [path])
+    columns = {name: list(values) for name, values in file.read().items()}
+    if column:
+        columns[column][0] = value
+    write_table(path, VIEWS, columns, file.meta if meta is None else meta)
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("class_id", [0, 1, 2]),
+        ("class_id", [-1, 0, 0]),
+        ("class_id", [0]),
+        ("boxes_px", [1.0] * 11),
+        ("boxes_px", [float("nan")] * 12),
+        ("share", []),
+    ],
+)
+def test_views_that_contradict_themselves_are_refused_at_once(tmp_path: Path, column: str, value: Any) -> None:
+    """Not at the step, hours later, that draws the view; the hint says what to remove."""
+    spoil(write_views(tmp_path), column, value)
+    with pytest.raises(SemslamError, match="contradict") as caught:
+        PictureSet.open(tmp_path)
+    assert "remove" in (caught.value.hint or "")
+
+
+def test_views_without_class_names_are_refused(tmp_path: Path) -> None:
+    """As are such with none."""
+    for meta in ({}, {"classes": []}):
+        spoil(write_views(tmp_path), "", None, meta)
+        with pytest.raises(SemslamError, match="holds no views"):
+            PictureSet.open(tmp_path)
+
+
+@pytest.mark.parametrize("column", ["colour", "depth", "instances"])
+def test_a_picture_that_is_none_is_one_clear_error(tmp_path: Path, column: str) -> None:
+    """Empty bytes, as a full disk leaves them."""
+    spoil(write_views(tmp_path), column, b"")
+    with pytest.raises(SemslamError):
+        PictureSet.open(tmp_path)[0]
+
+
+def test_a_damaged_file_says_what_to_do(tmp_path: Path) -> None:
+    """The hint is about views, not about results of a run."""
+    path = next(write_views(tmp_path).glob("*.parquet"))
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(SemslamError) as caught:
+        PictureSet.open(tmp_path)
+    assert "train pictures" in (caught.value.hint or "")
+
+
+def test_views_without_any_object_teach_nothing(tmp_path: Path) -> None:
+    """And are refused."""
+    with pytest.raises(SemslamError, match="shows an object"):
+        PictureSet.open(write_views(tmp_path, objects=0))

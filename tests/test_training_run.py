@@ -250,3 +250,50 @@ def test_another_task_s_run_is_not_exported(trained: Path, tmp_path: Path) -> No
     """A detector's run makes no segmenter."""
     with pytest.raises(SemslamError, match="not the run of a segmenter"):
         TASKS["segmenter"].export(tmp_path, trained, None, None)
+
+
+def test_a_checkpoint_with_flipped_bits_is_refused(tmp_path: Path) -> None:
+    """Weights that changed on the disk are not trained on in silence."""
+    tiny_fit(tmp_path)
+    path = tmp_path / CHECKPOINT
+    content = bytearray(path.read_bytes())
+    for offset in range(len(content) // 2, len(content) // 2 + 64):
+        content[offset] ^= 0x55
+    path.write_bytes(content)
+    with pytest.raises(SemslamError, match=r"cannot be read|another"):
+        tiny_fit(tmp_path)
+
+
+def test_a_checkpoint_of_another_shape_is_refused(tmp_path: Path) -> None:
+    """As a newer semslam with another network would find it."""
+    stored = tiny_fit(tmp_path) and read_checkpoint(tmp_path / CHECKPOINT)
+    stored["network"] = {"weight": torch.zeros(3, 3), "bias": torch.zeros(3)}
+    torch.save(stored, tmp_path / CHECKPOINT)
+    with pytest.raises(SemslamError, match="another shape"):
+        tiny_fit(tmp_path)
+
+
+def test_one_training_at_a_time_in_a_folder(tmp_path: Path) -> None:
+    """The second is refused before it writes anything."""
+    import fcntl
+
+    views, out = write_views(tmp_path / "views"), tmp_path / "run"
+    out.mkdir()
+    descriptor = os.open(out, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    with pytest.raises(SemslamError, match="Another training"):
+        train_detector(small_run(views, out))
+    os.close(descriptor)
+    assert not list(out.iterdir())
+
+
+def test_a_full_disk_is_told_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the disk says arrives as an OSError, which the command line knows how to tell; nothing half remains."""
+
+    def full(self: Path, _data: Any) -> int:
+        raise OSError(28, "No space left on device", str(self))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="No space left"):
+        tiny_fit(tmp_path)
+    assert not list(tmp_path.glob(".*partial*"))

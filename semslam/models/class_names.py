@@ -17,7 +17,7 @@ def names_from_file(path: Path) -> list[str]:
     """One name a line; blank lines, spaces, Windows line ends and a byte order mark do not count.
 
     Raises:
-        SemslamError: the file cannot be read as text, or names a class twice.
+        SemslamError: the file cannot be read as text, or names none, or one twice.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -27,6 +27,8 @@ def names_from_file(path: Path) -> list[str]:
             f"Class file `{path}` cannot be read: {reason}", hint="give a text file, a name a line"
         ) from error
     names = [line.strip() for line in lines if line.strip()]
+    if not names:
+        raise SemslamError(f"Class file `{path}` names no class", hint="give a text file, a name a line")
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise SemslamError(f"Class file `{path}` names `{twice[0]}` twice", hint="class names must differ")

@@ -72,7 +72,8 @@ class Letterbox:
         """Boxes (N, 4) of the model's input in pixels of the picture, not clipped."""
         shift = np.array([self.left, self.top, self.left, self.top], np.float32)
         scale = np.array([self.scale_x, self.scale_y, self.scale_x, self.scale_y], np.float32)
-        return np.asarray((boxes - shift) / scale, np.float32)
+        with np.errstate(over="ignore"):  # what becomes infinite is clipped
+            return np.asarray((boxes - shift) / scale, np.float32)
 
 
 def letterbox(picture: tuple[int, int], width: int, height: int, *, centred: bool = True) -> Letterbox:

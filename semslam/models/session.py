@@ -81,7 +81,10 @@ class Session:
             outputs: list[Array] = self._ort.run(None, cast)
         except Exception as error:  # onnxruntime throws a dozen types without a common base
             shapes = ", ".join(f"{name} {list(value.shape)}" for name, value in feeds.items())
-            raise SemslamError(f"Model `{self.path}` fails on input {shapes}: {_first_line(error)}") from error
+            raise SemslamError(
+                f"Model `{self.path}` fails on input {shapes}: {_first_line(error)}",
+                hint="see what it takes with `semslam models inspect FILE.onnx`, or export it again",
+            ) from error
         return outputs
 
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 _Command = TypeVar("_Command", bound=Callable[..., Any])
+_SEED = click.IntRange(0, 2**31 - 1)
 _MODEL_OPTIONS = ("detector", "classes", "segmenter_encoder", "segmenter_decoder")
 
 
@@ -615,8 +616,8 @@ def _training_options(command: _Command) -> _Command:
             click.option(
                 "--rate", type=click.FloatRange(0, min_open=True), help="Peak learning rate. Default: likewise."
             ),
-            click.option("--seed", type=int, default=1, show_default=True, help="Of everything random."),
-            click.option("--threads", type=click.IntRange(1), default=2, show_default=True, help="Of torch."),
+            click.option("--seed", type=_SEED, default=1, show_default=True, help="Of everything random."),
+            click.option("--threads", type=click.IntRange(1, 64), default=2, show_default=True, help="Of torch."),
             click.option("--device", type=click.Choice(("auto", "cpu", "cuda")), default="auto", show_default=True),
             click.option("--quiet", is_flag=True, help="Only warnings and errors."),
         )[::-1],
@@ -701,7 +702,7 @@ def models_inspect(file: Path, as_json: bool) -> None:
 @click.argument("task", type=click.Choice(("detector", "segmenter")))
 @click.argument("out", type=click.Path(path_type=Path))
 @click.option("--run", "run_folder", type=click.Path(path_type=Path), help="Folder of a training, finished or not.")
-@click.option("--random", "random_seed", type=int, metavar="SEED", help="Randomly initialised instead, from a seed.")
+@click.option("--random", "random_seed", type=_SEED, metavar="SEED", help="Randomly initialised instead, from a seed.")
 @click.option(
     "--classes", type=click.Path(path_type=Path), help="Class names of a random one. Default: simulated homes."
 )

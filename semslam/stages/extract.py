@@ -92,6 +92,12 @@ class ObjectClasses:
         kept = [i for i, n in enumerate(names) if (not config.select or n in config.select) and n not in config.exclude]
         renamed = {i: config.remap.get(names[i], names[i]) for i in kept}
         objects = tuple(dict.fromkeys(renamed.values()))
+        for name in objects:
+            if name in RESERVED or not name.strip() or not name.isprintable():
+                raise SemslamError(
+                    f"The detector has a class {name!r}, a name that no object class may have",
+                    hint="give it another with `extract.remap`, or leave it out with `extract.exclude`",
+                )
         if (FIRST_OBJECT + len(objects)) * config.side**2 >= 2**32:
             raise SemslamError(
                 f"{len(objects)} classes on {config.side} x {config.side} cells are more than a table can number",
@@ -193,6 +199,7 @@ def _fill(
     meta = {"classes": classes.all, "cell_m": config.cell_m, "side": config.side}
     observations = shard.table(OBSERVATIONS, meta)
     failures: list[SemslamError] = []
+    dropped = written = 0
     for frame, found in recognised:
         if isinstance(found, SemslamError):
             failures.append(found)
@@ -201,7 +208,9 @@ def _fill(
         seen = blind(frame, config) if isinstance(found, SemslamError) else look(frame, found, eyes)
         detections.append(seen.detections)
         observations.append(seen.observation)
-        _count(shard, seen)
+        dropped, written = dropped + seen.dropped, written + _count(shard, seen)
+    if dropped and not written:
+        shard.warn(f"nothing found: all {dropped} candidates of the detector had impossible values")
     return failures
 
 
@@ -379,14 +388,19 @@ def _frame(row: Row, config: ExtractConfig) -> Frame:
     return Frame(row, rgb, depth_m, in_range & (depth_m > 0), landing)
 
 
-def _count(shard: ShardWriter, seen: Seen) -> None:
+def _count(shard: ShardWriter, seen: Seen) -> int:
+    """Count what a keyframe showed; the number of its detections."""
     detections = len(seen.detections["frame"])
+    empty = sum(pixels == 0 for pixels in seen.detections["mask_pixels"])
+    if empty:
+        shard.count("masks_empty", empty)
     shard.count("detections", detections)
     shard.count("detections_without_depth", detections - seen.observation["objects"][0])
     if seen.dropped:
         shard.count("boxes_impossible", seen.dropped)
     if not detections:
         shard.count("frames_without_objects")
+    return detections
 
 
 def _unknown_class(key: str, name: str, names: Sequence[str]) -> SemslamError:

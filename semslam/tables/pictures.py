@@ -46,7 +46,7 @@ def _png(image: NDArray[Any], options: list[int]) -> bytes:
 
 
 def _decode(data: bytes, flags: int) -> NDArray[Any]:
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     if image is None:
         raise SemslamError("Stored picture cannot be decoded", hint="`semslam verify OUT` lists every damaged file")
     return image

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -80,14 +81,18 @@ class PromptedSegmenter:
         scale = np.array([box.scale_x, box.scale_y] * 2, np.float32)
         prompts = boxes * scale + np.array([box.left, box.top] * 2, np.float32)
         groups = [prompts[start : start + _AT_ONCE] for start in range(0, len(prompts), _AT_ONCE)]
-        runs = [self.decoder.run({"features": features, "boxes": group})[0] for group in groups]
-        logits = np.concatenate(runs).astype(np.float32, copy=False)
+        logits = np.concatenate([self._answers(features, group) for group in groups])
+        return np.nan_to_num(logits, nan=_NO_LOGIT)
+
+    def _answers(self, features: NDArray[Any], boxes: Floats) -> Floats:
+        """(N, m, m) of some boxes (N, 4) in pixels of the encoder's input."""
+        logits = self.decoder.run({"features": features, "boxes": boxes})[0]
         if logits.ndim != 3 or len(logits) != len(boxes):
             raise SemslamError(
                 f"Segmenter decoder `{self.decoder.path}` answers {len(boxes)} boxes with {list(logits.shape)}",
                 hint="wants masks (N, m, m), one a box",
             )
-        return np.nan_to_num(logits, nan=_NO_LOGIT)
+        return np.asarray(logits, np.float32)
 
 
 def is_prompted(encoder: Path) -> bool:

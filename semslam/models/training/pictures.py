@@ -31,6 +31,7 @@ CLASSES = (
     "chair", "table", "sofa", "bed", "bookshelf", "dresser", "plant", "lamp", "tv", "bin", "refrigerator", "toilet",
 )  # fmt: skip
 """Of simulated homes; a test compares them with the simulator's."""
+_LISTS = ("class_id", "pixels", "share", "cut")
 _AREA_PX, _WIDTH_PX = 640 * 480, 640
 
 
@@ -106,13 +107,15 @@ class PictureSet:
         paths = sorted(folder.glob("*.parquet"))[homes]
         if not paths:
             raise SemslamError(f"No views in `{folder}`", hint=f"make some: `semslam train pictures {folder}`")
-        files = [TableFiles(VIEWS, [path]) for path in paths]
-        names = {tuple(file.meta["classes"]) for file in files}
+        homes_read = [_home(path) for path in paths]
+        names = {home_names for home_names, _ in homes_read}
         if len(names) > 1:
             raise SemslamError(
                 f"Files in `{folder}` disagree about the classes", hint="keep each set in its own folder"
             )
-        rows = [row for file in files for row in _rows(file)]
+        rows = [row for _, home_rows in homes_read for row in home_rows]
+        if not any(len(row["class_id"]) for row in rows):
+            raise SemslamError(f"No view in `{folder}` shows an object", hint="make others: `semslam train pictures`")
         return PictureSet(
             names.pop(), rows, _fingerprint(paths), tuple(path.stem for path in paths), _origin(folder, len(paths))
         )
@@ -150,15 +153,39 @@ def _scaled(item: SeenObject, across: float, down: float) -> SeenObject:
     return SeenObject(item.instance, item.class_id, left, top, right, bottom, pixels, item.share, item.cut)
 
 
-def _rows(file: TableFiles) -> list[dict[str, Any]]:
-    columns = file.read()
-    return [{name: values[index] for name, values in columns.items()} for index in range(file.rows)]
+def _home(path: Path) -> tuple[tuple[str, ...], list[dict[str, Any]]]:
+    """Class names and rows of the views of one home.
+
+    Raises:
+        SemslamError: the file is damaged, empty, or contradicts itself.
+    """
+    again = f"remove `{path}`, then run the `semslam train pictures` again that made it"
+    try:
+        file = TableFiles(VIEWS, [path])
+        columns, names = file.read(), tuple(str(name) for name in file.meta.get("classes", ()))
+    except SemslamError as error:
+        raise SemslamError(error.message, hint=again) from error
+    rows = [{name: values[index] for name, values in columns.items()} for index in range(file.rows)]
+    if not rows or not names or not all(_consistent(row, len(names)) for row in rows):
+        raise SemslamError(f"`{path}` holds no views, or such that contradict themselves", hint=again)
+    return names, rows
+
+
+def _consistent(row: dict[str, Any], classes: int) -> bool:
+    """If the lists of a view go together and tell of classes and boxes that there are."""
+    count = len(row["instance"])
+    if len(row["boxes_px"]) != 4 * count or any(len(row[name]) != count for name in _LISTS):
+        return False
+    known = all(0 <= number < classes for number in row["class_id"])
+    return known and bool(np.isfinite(np.asarray(row["boxes_px"], np.float64)).all())
 
 
 def _picture(row: dict[str, Any]) -> Picture:
-    instances = cv2.imdecode(np.frombuffer(row["instances"], np.uint8), cv2.IMREAD_UNCHANGED)
-    if instances is None:
-        raise SemslamError("A view's instance image cannot be decoded", hint="make the views again")
+    data = np.frombuffer(row["instances"], np.uint8)
+    instances = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    rgb, depth_m = decode_colour(row["colour"]), decode_depth(row["depth"])
+    if instances is None or not instances.shape == depth_m.shape == rgb.shape[:2]:
+        raise SemslamError("The pictures of a view do not go together", hint="make the views again")
     boxes = np.asarray(row["boxes_px"], np.float64).reshape(-1, 4).tolist()
     objects = tuple(
         SeenObject(int(instance), int(class_id), left, top, right, bottom, int(pixels), float(share), bool(cut))
@@ -166,7 +193,7 @@ def _picture(row: dict[str, Any]) -> Picture:
             row["instance"], row["class_id"], boxes, row["pixels"], row["share"], row["cut"], strict=True
         )
     )
-    return Picture(decode_colour(row["colour"]), decode_depth(row["depth"]), np.asarray(instances, np.uint16), objects)
+    return Picture(rgb, depth_m, np.asarray(instances, np.uint16), objects)
 
 
 def _origin(folder: Path, homes: int) -> str:

@@ -6,7 +6,10 @@ A run's folder holds `checkpoint.pt` and `curves.csv` while it lasts, and at its
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable, Mapping, Sequence
+import fcntl
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -83,6 +86,29 @@ def asked(
     return Run(views, out, schedule, threads, device, watch, test, command)
 
 
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Nobody else trains into the folder meanwhile.
+
+    Raises:
+        SemslamError: somebody does, or it is no folder.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise SemslamError(f"`{folder}` is a file", hint="give another `--out`") from error
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError as error:
+        raise SemslamError(
+            f"Another training is at work in `{folder}`", hint="wait for it, or give another `--out`"
+        ) from error
+    finally:
+        os.close(descriptor)
+
+
 def train_detector(run: Run) -> list[Path]:
     """Train a detector and export it. A run that was killed goes on where it was.
 
@@ -92,6 +118,11 @@ def train_detector(run: Run) -> list[Path]:
     device = prepare(run)
     pictures = PictureSet.open(run.data)
     unseen = _unseen(run, pictures)
+    with _alone(run.out):
+        return _detector_made(run, device, pictures, unseen)
+
+
+def _detector_made(run: Run, device: torch.device, pictures: PictureSet, unseen: PictureSet | None) -> list[Path]:
     network = new_detector(pictures.class_names, run.schedule.seed)
     network = network.to(device=device, memory_format=torch.channels_last)
     batches = Batches.of(pictures, steps=run.schedule.steps, batch=run.schedule.batch, seed=run.schedule.seed)
@@ -119,6 +150,11 @@ def train_segmenter(run: Run) -> list[Path]:
     device = prepare(run)
     pictures = PictureSet.open(run.data)
     unseen = _unseen(run, pictures)
+    with _alone(run.out):
+        return _segmenter_made(run, device, pictures, unseen)
+
+
+def _segmenter_made(run: Run, device: torch.device, pictures: PictureSet, unseen: PictureSet | None) -> list[Path]:
     network = new_segmenter(run.schedule.seed)
     network = network.to(device=device, memory_format=torch.channels_last)
     batches = PromptBatches.of(pictures, steps=run.schedule.steps, batch=run.schedule.batch, seed=run.schedule.seed)

@@ -7,9 +7,12 @@ same number of threads on the same machine the weights come out the same.
 from __future__ import annotations
 
 import csv
+import io
 import math
 import os
+import tempfile
 import time
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -48,7 +51,7 @@ class Schedule:
     average: float = 0.998
     """Weight of the past in the moving average of the weights; that average is what is kept."""
     checkpoint_s: float = 60.0
-    """Seconds after which the next report saves a checkpoint."""
+    """Seconds after which the next report saves a checkpoint, as the first one does."""
     report_every: int = 50
     """Steps between reports."""
 
@@ -100,10 +103,12 @@ def fit(
     run.pop("checkpoint_s")
     run.pop("report_every")
     state = _State.start(network, schedule)
+    _require_writable(folder)
     first = state.resume(folder / CHECKPOINT, run)
     curves = _Curves(folder / _CURVES, first)
     network.train()
-    saved, since, sums, counted = time.monotonic(), time.monotonic(), dict[str, float](), 0
+    saved: float | None = None
+    since, sums, counted = time.monotonic(), dict[str, float](), 0
     for step, batch in _ahead(batch_of, first, schedule.steps):
         value, parts = loss(network, batch)
         state.step(value, schedule.rate(step), step)
@@ -117,7 +122,7 @@ def fit(
             if watch:
                 watch(Progress(step + 1, schedule.steps, means, counted / (time.monotonic() - since)))
             sums, counted, since = {}, 0, time.monotonic()
-            if last or time.monotonic() - saved > schedule.checkpoint_s:
+            if last or saved is None or time.monotonic() - saved > schedule.checkpoint_s:
                 state.save(folder / CHECKPOINT, run, step + 1)
                 saved = time.monotonic()
     trained: nn.Module = state.average.module
@@ -133,8 +138,11 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise SemslamError(f"No checkpoint at `{path}`", hint="name the folder of a `semslam train` run")
     try:
+        with zipfile.ZipFile(path) as archive:
+            if archive.testzip() is not None:  # torch itself does not look at the checksums
+                raise zipfile.BadZipFile
         stored: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-        complete = {"run", "step", "network", "average", "optimizer"} <= set(stored)
+        complete = _is_checkpoint(stored)
     except Exception as error:  # torch throws a dozen types without a common base
         raise SemslamError(
             f"Checkpoint `{path}` cannot be read", hint="remove it to begin again, or give another folder"
@@ -142,6 +150,25 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if not complete:
         raise SemslamError(f"`{path}` is no checkpoint of a training", hint="name the folder of a `semslam train` run")
     return stored
+
+
+def _is_checkpoint(stored: Any) -> bool:
+    parts = {"run", "step", "network", "average", "optimizer"}
+    if not isinstance(stored, dict) or not parts <= set(stored) or not isinstance(stored["run"], dict):
+        return False
+    return isinstance(stored["step"], int) and 0 <= stored["step"] <= stored["run"].get("steps", -1)
+
+
+def _require_writable(folder: Path) -> None:
+    """See that a checkpoint can be written before there is one to write.
+
+    Raises:
+        SemslamError: it cannot.
+    """
+    if (folder / CHECKPOINT).is_dir():
+        raise SemslamError(f"`{folder / CHECKPOINT}` is a folder", hint="remove it, or give another `--out`")
+    with tempfile.TemporaryFile(dir=folder):
+        pass
 
 
 @dataclass
@@ -186,9 +213,15 @@ class _State:
             raise SemslamError(
                 f"Checkpoint `{path}` is of another run", details=was, hint="remove it, or give another folder"
             )
-        self.network.load_state_dict(stored["network"])
-        self.average.load_state_dict(stored["average"])
-        self.optimizer.load_state_dict(stored["optimizer"])
+        try:
+            self.network.load_state_dict(stored["network"])
+            self.average.load_state_dict(stored["average"])
+            self.optimizer.load_state_dict(stored["optimizer"])
+        except (RuntimeError, ValueError, KeyError, TypeError) as error:
+            raise SemslamError(
+                f"Checkpoint `{path}` is of a network of another shape",
+                hint="go on with the version of semslam that began it, or give another folder",
+            ) from error
         return int(stored["step"])
 
     def save(self, path: Path, run: Mapping[str, Any], step: int) -> None:
@@ -200,8 +233,10 @@ class _State:
             "average": self.average.state_dict(),
             "optimizer": self.optimizer.state_dict(),
         }
+        packed = io.BytesIO()  # torch wraps what the disk says into errors of its own
+        torch.save(content, packed)
         try:
-            torch.save(content, temporary)
+            temporary.write_bytes(packed.getbuffer())
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
