@@ -82,7 +82,7 @@ class PromptedSegmenter:
         prompts = boxes * scale + np.array([box.left, box.top] * 2, np.float32)
         groups = [prompts[start : start + _AT_ONCE] for start in range(0, len(prompts), _AT_ONCE)]
         logits = np.concatenate([self._answers(features, group) for group in groups])
-        return np.nan_to_num(logits, nan=_NO_LOGIT)
+        return np.asarray(np.nan_to_num(logits, nan=_NO_LOGIT), np.float32)
 
     def _answers(self, features: NDArray[Any], boxes: Floats) -> Floats:
         """(N, m, m) of some boxes (N, 4) in pixels of the encoder's input."""
