@@ -20,7 +20,8 @@ pytest.importorskip("onnxscript", reason="needs the extra [train]")
 from semslam.errors import SemslamError  # noqa: E402
 from semslam.models.detectors import Detector as OpenDetector  # noqa: E402
 from semslam.models.nets.detector import Detector, DetectorShape, Exported, cells  # noqa: E402
-from semslam.models.training.detector import Batches, Examples, assign, generalised_iou, size_at  # noqa: E402
+from semslam.models.training.curriculum import size_at  # noqa: E402
+from semslam.models.training.detector import SIZES, Batches, Examples, assign, generalised_iou  # noqa: E402
 from semslam.models.training.pictures import CLASSES, PictureSet  # noqa: E402
 from semslam.models.training.runs import TASKS, asked, new_detector, train_detector, trained_detector  # noqa: E402
 from semslam.models.training.trainer import CHECKPOINT, Schedule, fit, read_checkpoint  # noqa: E402
@@ -168,9 +169,9 @@ def test_batches_depend_on_seed_and_step_alone(tmp_path: Path) -> None:
     two(7)
     first, second = one(50), two(50)
     assert torch.equal(first.images, second.images)
-    assert first.images.shape[2:] == (size_at(0.5)[1], size_at(0.5)[0])
+    assert first.images.shape[2:] == (size_at(SIZES, 0.5)[1], size_at(SIZES, 0.5)[0])
     assert not torch.equal(one(51).images, first.images)
-    assert [size_at(done) for done in (0.0, 0.99)] == [(256, 192), (384, 288)]
+    assert [size_at(SIZES, done) for done in (0.0, 0.99)] == [(256, 192), (384, 288)]
 
 
 def test_an_object_is_answered_for_by_cells_inside_it() -> None:

@@ -18,16 +18,15 @@ from torch import Tensor, nn
 
 from semslam.models.nets.detector import INPUT_HEIGHT, INPUT_WIDTH, STRIDES, boxes_of, cells
 from semslam.models.training.augment import Strength, randomised
+from semslam.models.training.curriculum import CALM_FROM, odds, size_at
 from semslam.models.training.pictures import Picture, PictureSet, SeenObject, resized
 
 SIZES = ((0.45, 256, 192), (0.8, 320, 240), (1.0, INPUT_WIDTH, INPUT_HEIGHT))
 """Until which share of the steps, and the width and height of the pictures until then."""
-_CALM = 0.93
-"""From this share of the steps on, pictures are changed but little: they end up as cameras give them."""
+CALM = Strength(0.5, 0.3, 0.5, 0.0, 0.05)
+"""At the end."""
 _CANDIDATES = 10
 _BOX_WEIGHT = 5.0
-_RARE_CLASS = 0.5
-"""How strongly views with rare classes are drawn more often; 0 draws all alike."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +79,13 @@ class Batches:
         """Decode all pictures, small enough to keep."""
         size = INPUT_WIDTH, INPUT_HEIGHT
         kept = [_compact(resized(pictures[index], *size)) for index in range(len(pictures))]
-        return Batches(kept, _weights(pictures), steps, batch, seed, strength or Strength())
+        return Batches(kept, odds(pictures), steps, batch, seed, strength or Strength())
 
     def __call__(self, step: int) -> Batch:
         rng = np.random.default_rng([self.seed, step])
-        width, height = size_at(step / self.steps)
-        calm = step >= _CALM * self.steps
-        strength = Strength(0.5, 0.3, 0.5, 0.0, 0.05) if calm else self.strength
+        width, height = size_at(SIZES, step / self.steps)
+        calm = step >= CALM_FROM * self.steps
+        strength = CALM if calm else self.strength
         chosen = rng.choice(len(self.pictures), (self.batch, 2), p=self.weights)
         made = []
         for first, second in chosen.tolist():
@@ -94,11 +93,6 @@ class Batches:
             picture, other = (resized(_plain(self.pictures[i]), width, height) for i in (first, second))
             made.append(randomised(picture, other, rng, strength))
         return collated(made)
-
-
-def size_at(done: float) -> tuple[int, int]:
-    """Width and height of the pictures when this share of the steps is done."""
-    return next((width, height) for until, width, height in SIZES if done < until or until >= 1)
 
 
 def collated(pictures: Sequence[Picture]) -> Batch:
@@ -128,16 +122,6 @@ def _compact(picture: Picture) -> Picture:
 
 def _plain(picture: Picture) -> Picture:
     return Picture(picture.rgb, picture.depth_m.astype(np.float32), picture.instances, picture.objects)
-
-
-def _weights(pictures: PictureSet) -> NDArray[np.float64]:
-    """Views that show a rare class come more often."""
-    shares = np.zeros(len(pictures.class_names))
-    for present in pictures.classes_of:
-        shares[list(present)] += 1 / len(pictures)
-    weights = np.array([max((1 / shares[i] for i in present), default=1.0) for present in pictures.classes_of])
-    weights = weights**_RARE_CLASS
-    return np.asarray(weights / weights.sum(), np.float64)
 
 
 def detection_loss(network: nn.Module, batch: Batch) -> tuple[Tensor, Mapping[str, float]]:

@@ -29,6 +29,7 @@ from semslam.models.nets.segmenter import (
     Segmenter,
 )
 from semslam.models.training.augment import Strength, randomised
+from semslam.models.training.curriculum import CALM_FROM, odds, size_at
 from semslam.models.training.export import export_onnx
 from semslam.models.training.pictures import Picture, PictureSet, SeenObject, resized
 
@@ -42,9 +43,6 @@ SIZES = ((0.35, 320, 240), (0.65, 448, 336), (1.0, WIDTH, HEIGHT))
 USUAL = Strength(paste=0.3, no_depth=0.1)
 CALM = Strength(0.5, 0.3, 0.5, 0.1, 0.05)
 """At the end pictures are changed but little: they end up as cameras give them."""
-_CALM_FROM = 0.93
-_RARE_CLASS = 0.5
-"""How strongly views with rare classes are drawn more often; 0 draws all alike."""
 _JITTER, _MOST_JITTER, _EXACT = 0.045, 0.12, 0.25
 """Of a box's sides: deviation of its edges, its limit, and the share of boxes left as they are."""
 _FINEST = 4
@@ -92,13 +90,13 @@ class PromptBatches:
         pictures: PictureSet, *, steps: int, batch: int, seed: int, strength: Strength | None = None
     ) -> PromptBatches:
         """Pictures stay as the files hold them, decoded step by step: at full size they would fill the memory."""
-        return PromptBatches(pictures, _odds(pictures), steps, batch, seed, strength or USUAL)
+        return PromptBatches(pictures, odds(pictures), steps, batch, seed, strength or USUAL)
 
     def __call__(self, step: int) -> Prompts:
         rng = np.random.default_rng([self.seed, 0x5E6, step])
         done = step / self.steps
-        width, height = size_at(done)
-        strength = CALM if done >= _CALM_FROM else self.strength
+        width, height = size_at(SIZES, done)
+        strength = CALM if done >= CALM_FROM else self.strength
         chosen = rng.choice(len(self.pictures), (self.batch, 2), p=self.odds).tolist()
         made = [self._randomised(first, second, (width, height), rng, strength) for first, second in chosen]
         return collated(made, rng)
@@ -110,11 +108,6 @@ class PromptBatches:
         picture = resized(self.pictures[first], *size)
         other = resized(self.pictures[second], *size) if pastes else None
         return randomised(picture, other, rng, replace(strength, paste=1.0))
-
-
-def size_at(done: float) -> tuple[int, int]:
-    """Width and height of the pictures when this share of the steps is done."""
-    return next((width, height) for until, width, height in SIZES if done < until or until >= 1)
 
 
 def collated(pictures: Sequence[Picture], rng: np.random.Generator) -> Prompts:
@@ -188,16 +181,6 @@ def mask_overlap(logits: Tensor, masks: Tensor) -> Tensor:
     given, wanted = logits > 0, masks > 0.5
     union = (given | wanted).sum((1, 2))
     return (given & wanted).sum((1, 2)) / union.clamp(min=1)
-
-
-def _odds(pictures: PictureSet) -> NDArray[np.float64]:
-    """Views that show a rare class come more often."""
-    shares = np.zeros(len(pictures.class_names))
-    for present in pictures.classes_of:
-        shares[list(present)] += 1 / len(pictures)
-    rarity = np.array([max((1 / shares[index] for index in present), default=1.0) for present in pictures.classes_of])
-    odds = rarity**_RARE_CLASS
-    return np.asarray(odds / odds.sum(), np.float64)
 
 
 def new_segmenter(seed: int) -> Segmenter:
