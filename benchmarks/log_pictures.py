@@ -11,7 +11,6 @@ files are kept: remove the folder after a change of the simulator.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -37,7 +36,8 @@ from semslam.sim.log import COLOUR, DEPTH, INSTANCES, LogOptions
 from semslam.sim.splits import load_split
 from semslam.sim.unfamiliar import estranged, unfamiliar_camera
 from semslam.sim.vehicle import draw_robot
-from semslam.tables.parquet import TableFiles, write_table
+from semslam.sim.views import lens_row, object_columns, write_views
+from semslam.tables.parquet import TableFiles
 from semslam.tables.pictures import encode_depth
 from semslam.tables.spec import HOME_OBJECTS, TRUTH, VIEWS
 
@@ -104,7 +104,7 @@ def log_views(log: TestLog, work: Path, every: int, *, unfamiliar: bool, most: i
         poses = poses_of(log)
         frames = sorted(poses)[::every][:most]
         rows = list(_unfamiliar_rows(log, poses, frames) if unfamiliar else _recorded_rows(log, poses, frames))
-        _write(path, rows, {"classes": list(CLASSES), "variant": log.variant, "seed": log.home_seed})
+        write_views(path, rows, {"classes": list(CLASSES), "variant": log.variant, "seed": log.home_seed})
     return LogViews(log, PictureSet.open(path.parent), tuple(TableFiles(VIEWS, [path]).read(["view"])["view"]))
 
 
@@ -161,7 +161,7 @@ def _recorded_rows(log: TestLog, poses: Mapping[int, Matrix], frames: Sequence[i
             continue
         pictures = {"colour": colour.data, "depth": encode_depth(decode_depth(depth)), "instances": shown.data}
         seen = _seen(home, camera, poses[frame] @ robot.base_from_camera, _decoded(shown.data))
-        yield {"view": frame, **pictures, **place, **_lens_row(camera), **_object_columns(seen)}
+        yield {"view": frame, **pictures, **place, **lens_row(camera), **object_columns(seen)}
 
 
 def _images(log: TestLog) -> dict[str, dict[int, CompressedImage]]:
@@ -208,7 +208,7 @@ def _unfamiliar_rows(log: TestLog, poses: Mapping[int, Matrix], frames: Sequence
             "instances": encode_png(sight.instances),
         }
         seen = _seen(home, camera, pose, sight.instances)
-        yield {"view": frame, **pictures, **place, **_lens_row(camera), **_object_columns(seen)}
+        yield {"view": frame, **pictures, **place, **lens_row(camera), **object_columns(seen)}
 
 
 # --------------------------------------------------------------------------------------------------------------- rows
@@ -227,27 +227,3 @@ def _seen(home: Home, camera: Camera, world_from_camera: Matrix, instances: NDAr
     rgb = np.zeros((*instances.shape, 3), np.uint8)
     sight = Sight(rgb, blank, instances, np.zeros(instances.shape, np.uint8), blank)
     return [box for box in true_boxes(home, sight, camera, world_from_camera) if box.pixels >= LEAST_PIXELS]
-
-
-def _lens_row(camera: Camera) -> dict[str, float]:
-    return {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
-
-
-def _object_columns(seen: Sequence[TrueBox]) -> dict[str, list[Any]]:
-    return {
-        "instance": [box.instance for box in seen],
-        "class_id": [box.class_id for box in seen],
-        "boxes_px": [float(side) for box in seen for side in (box.left, box.top, box.right, box.bottom)],
-        "pixels": [box.pixels for box in seen],
-        "share": [box.share for box in seen],
-        "cut": [int(box.cut) for box in seen],
-    }
-
-
-def _write(path: Path, rows: Sequence[dict[str, Any]], meta: dict[str, Any]) -> None:
-    temporary = path.with_name(f".{path.name}.partial-{os.getpid()}")
-    try:
-        write_table(temporary, VIEWS, {c.name: [row[c.name] for row in rows] for c in VIEWS.columns}, meta)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

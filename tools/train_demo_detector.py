@@ -32,6 +32,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from semslam.geometry.camera import Camera
+from semslam.models.training.detector import generalised_iou, inside_boxes, pairwise_iou
+from semslam.models.training.export import strip_traces
 from semslam.sim.boxes import TrueBox, true_boxes
 from semslam.sim.dataset import versions
 from semslam.sim.eye import Eye, Sight
@@ -367,13 +369,13 @@ def assign(boxes: Tensor, scores: Tensor, centres: Tensor, truth: Example) -> tu
     """
     wanted, goal, used = torch.zeros_like(scores), torch.zeros_like(boxes), torch.ones(len(boxes))
     if len(truth.ignored):
-        used[_inside(centres, torch.from_numpy(truth.ignored)).any(0)] = 0
+        used[inside_boxes(centres, torch.from_numpy(truth.ignored)).any(0)] = 0
     if not len(truth.boxes):
         return wanted, goal, used
     objects, classes = torch.from_numpy(truth.boxes), torch.from_numpy(truth.classes)
     overlap = pairwise_iou(objects, boxes).clamp(min=1e-6)  # (G, cells)
     quality = scores[:, classes].T.clamp(min=1e-6).sqrt() * overlap**4
-    quality = quality * _inside(centres, objects)
+    quality = quality * inside_boxes(centres, objects)
     best = quality.topk(10, dim=1)
     mine = torch.zeros_like(quality).scatter_(1, best.indices, 1.0) * (quality > 0)
     owner = (mine * overlap).argmax(0)
@@ -386,30 +388,6 @@ def assign(boxes: Tensor, scores: Tensor, centres: Tensor, truth: Example) -> tu
     goal[cells] = objects[owner[cells]]
     used[cells] = 1
     return wanted, goal, used
-
-
-def _inside(centres: Tensor, boxes: Tensor) -> Tensor:
-    """(G, cells) True where the centre lies in the box."""
-    low, high = centres[None] - boxes[:, None, :2], boxes[:, None, 2:] - centres[None]
-    return torch.cat([low, high], -1).amin(-1) > 0
-
-
-def pairwise_iou(first: Tensor, second: Tensor) -> Tensor:
-    """(G, 4), (N, 4) -> (G, N)"""
-    low = torch.maximum(first[:, None, :2], second[None, :, :2])
-    high = torch.minimum(first[:, None, 2:], second[None, :, 2:])
-    shared = (high - low).clamp(min=0).prod(-1)
-    areas = [(b[:, 2:] - b[:, :2]).prod(-1) for b in (first, second)]
-    return shared / (areas[0][:, None] + areas[1][None] - shared)
-
-
-def generalised_iou(first: Tensor, second: Tensor) -> Tensor:
-    """(N, 4), (N, 4) -> (N,); Rezatofighi et al. 2019."""
-    low, high = torch.maximum(first[:, :2], second[:, :2]), torch.minimum(first[:, 2:], second[:, 2:])
-    shared = (high - low).clamp(min=0).prod(-1)
-    union = sum((b[:, 2:] - b[:, :2]).prod(-1) for b in (first, second)) - shared
-    hull = (torch.maximum(first[:, 2:], second[:, 2:]) - torch.minimum(first[:, :2], second[:, :2])).prod(-1)
-    return shared / union - (hull - union) / hull
 
 
 # Export and evaluation
@@ -433,17 +411,6 @@ def export(network: Detector, target: Path) -> None:
     onnx.helper.set_model_props(model, {"names": repr(names), "task": "detect", "license": "Apache-2.0"})
     onnx.checker.check_model(model)
     target.write_bytes(model.SerializeToString(deterministic=True))
-
-
-def strip_traces(model: onnx.ModelProto) -> None:
-    """Drop what the exporter notes about source lines: it makes the file larger and differ between machines."""
-    del model.graph.metadata_props[:]
-    for node in model.graph.node:
-        del node.metadata_props[:]
-        node.doc_string = ""
-    for value in [*model.graph.input, *model.graph.output, *model.graph.value_info]:
-        del value.metadata_props[:]
-    del model.graph.value_info[:]
 
 
 def evaluate(model: Path, examples: list[Example], *, min_score: float = 0.3, shrink: int = 1) -> dict[str, float]:

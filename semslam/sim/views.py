@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -191,8 +191,6 @@ def record_views(path: Path, home_seed: int, views: int, *, unfamiliar: bool = F
     import numpy as np
 
     from semslam.sim.layout import make_home
-    from semslam.tables.parquet import write_table
-    from semslam.tables.spec import VIEWS
 
     cv2.setNumThreads(1)
     rng = np.random.default_rng([home_seed, 0x71E3])
@@ -204,6 +202,18 @@ def record_views(path: Path, home_seed: int, views: int, *, unfamiliar: bool = F
         home = estranged(home, home_seed)
     rows = _looks(home, views, rng, unfamiliar=unfamiliar)
     meta = {"classes": list(home.classes), "variant": variant, "seed": home_seed, "unfamiliar": unfamiliar}
+    write_views(path, rows, meta)
+
+
+def write_views(path: Path, rows: Sequence[Mapping[str, Any]], meta: Mapping[str, Any]) -> None:
+    """Write a file of table 15, whole or not at all.
+
+    Raises:
+        OSError: the disk is full, or the folder cannot be written.
+    """
+    from semslam.tables.parquet import write_table
+    from semslam.tables.spec import VIEWS
+
     columns = {column.name: [row[column.name] for row in rows] for column in VIEWS.columns}
     temporary = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:
@@ -230,7 +240,7 @@ def _looks(home: Home, views: int, rng: np.random.Generator, *, unfamiliar: bool
         seen = [box for box in true_boxes(home, sight, camera, pose) if box.pixels >= _FLAT_PIXELS]
         if len(seen) >= _LEAST_IN_VIEW:
             place = {"view": len(rows), "camera_height_m": height_m, "camera_pitch_rad": pitch_rad}
-            rows.append({**place, **_lens_row(camera), **_pictures(sight, rng), **_object_columns(seen)})
+            rows.append({**place, **lens_row(camera), **_pictures(sight, rng), **object_columns(seen)})
     if len(rows) < views:
         raise SemslamError(f"Home {home.seed} shows hardly anything", hint="use another `--seed`")
     return rows
@@ -289,7 +299,8 @@ def _promise(home: Home, camera: Camera, world_from_camera: Array) -> int:
     return int(((np.abs(across) < ahead * camera.cx / camera.fx) & (ahead > near) & (ahead < far)).sum())
 
 
-def _lens_row(camera: Camera) -> dict[str, float]:
+def lens_row(camera: Camera) -> dict[str, float]:
+    """Columns of a view that tell its lens."""
     return {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
 
 
@@ -303,7 +314,8 @@ def _pictures(sight: Any, rng: np.random.Generator) -> dict[str, bytes]:
     return {"colour": encode_jpeg(rgb, 92), "depth": encode_png(depth_mm), "instances": encode_png(sight.instances)}
 
 
-def _object_columns(seen: Sequence[TrueBox]) -> dict[str, list[Any]]:
+def object_columns(seen: Sequence[TrueBox]) -> dict[str, list[Any]]:
+    """Columns of a view that tell what is to be seen of its objects."""
     return {
         "instance": [box.instance for box in seen],
         "class_id": [box.class_id for box in seen],

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from semslam.errors import SemslamError
 from semslam.models.class_names import names_from_metadata
-from semslam.models.detections import Floats, Indices
+from semslam.models.detections import Floats, Indices, Letterbox, fit
 from semslam.models.detectors.adapter import Array
 from semslam.models.session import Signature, Tensor
 
@@ -213,3 +213,10 @@ def corners(centre_size: Floats) -> Floats:
     half = centre_size[:, 2:4] * np.float32(0.5)
     with np.errstate(invalid="ignore"):
         return np.concatenate([centre_size[:, :2] - half, centre_size[:, :2] + half], axis=1)
+
+
+def centred_picture(rgb: NDArray[np.uint8], signature: Signature) -> tuple[dict[str, Array], Letterbox]:
+    """The YOLO families' one input: (1, 3, h, w) RGB, 0 to 1, the picture in the middle of grey."""
+    height, width = input_size(signature)
+    canvas, box = fit(rgb, width, height)
+    return {signature.inputs[0].name: planes(canvas, UNIT)}, box

@@ -13,17 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semslam.errors import SemslamError
-from semslam.models.detections import Detections, Floats, Indices, Letterbox, fit, select_indices
+from semslam.models.detections import Detections, Floats, Indices, Letterbox, select_indices
 from semslam.models.detectors.adapter import Adapter, Array, Look
 from semslam.models.detectors.layout import (
-    UNIT,
+    centred_picture,
     class_numbers,
     head_is_rtdetr,
-    input_size,
     likely,
     names_stated,
     one_picture,
-    planes,
     query_rows,
     single,
 )
@@ -54,9 +52,7 @@ class Yolov10:
         self, rgb: NDArray[np.uint8], _depth_m: Floats | None, signature: Signature
     ) -> tuple[Mapping[str, Array], Letterbox]:
         """(1, 3, h, w) RGB, 0 to 1."""
-        height, width = input_size(signature)
-        canvas, box = fit(rgb, width, height)
-        return {signature.inputs[0].name: planes(canvas, UNIT)}, box
+        return centred_picture(rgb, signature)
 
     def postprocess(self, outputs: list[Array], look: Look, _signature: Signature) -> Detections:
         """Rows as they are."""

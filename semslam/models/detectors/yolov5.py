@@ -11,17 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.models.detections import Detections, Floats, Letterbox, fit, select
+from semslam.models.detections import Detections, Floats, Letterbox, select
 from semslam.models.detectors.adapter import Adapter, Array, Look
 from semslam.models.detectors.layout import (
-    UNIT,
     best_class,
+    centred_picture,
     corners,
     dense_rows,
     input_size,
     likely,
     one_picture,
-    planes,
     single,
 )
 from semslam.models.session import Signature
@@ -49,9 +48,7 @@ class Yolov5:
         self, rgb: NDArray[np.uint8], _depth_m: Floats | None, signature: Signature
     ) -> tuple[Mapping[str, Array], Letterbox]:
         """(1, 3, h, w) RGB, 0 to 1."""
-        height, width = input_size(signature)
-        canvas, box = fit(rgb, width, height)
-        return {signature.inputs[0].name: planes(canvas, UNIT)}, box
+        return centred_picture(rgb, signature)
 
     def postprocess(self, outputs: list[Array], look: Look, _signature: Signature) -> Detections:
         """Score = objectness * class probability."""

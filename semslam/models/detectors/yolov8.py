@@ -11,17 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.models.detections import Detections, Floats, Indices, Letterbox, fit, select
+from semslam.models.detections import Detections, Floats, Indices, Letterbox, select
 from semslam.models.detectors.adapter import Adapter, Array, Look
 from semslam.models.detectors.layout import (
-    UNIT,
+    centred_picture,
     corners,
-    input_size,
     likely,
     names_stated,
     one_picture,
     one_table,
-    planes,
     single,
 )
 from semslam.models.session import Signature
@@ -41,9 +39,7 @@ class Yolov8:
         self, rgb: NDArray[np.uint8], _depth_m: Floats | None, signature: Signature
     ) -> tuple[Mapping[str, Array], Letterbox]:
         """(1, 3, h, w) RGB, 0 to 1."""
-        height, width = input_size(signature)
-        canvas, box = fit(rgb, width, height)
-        return {signature.inputs[0].name: planes(canvas, UNIT)}, box
+        return centred_picture(rgb, signature)
 
     def postprocess(self, outputs: list[Array], look: Look, _signature: Signature) -> Detections:
         """The best class of each candidate."""

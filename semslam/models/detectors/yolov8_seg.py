@@ -14,9 +14,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.models.detections import Detections, Floats, Letterbox, fit, select_indices
+from semslam.models.detections import Detections, Floats, Letterbox, select_indices
 from semslam.models.detectors.adapter import Adapter, Array, Look
-from semslam.models.detectors.layout import UNIT, corners, input_size, known_sizes, one_picture, planes, single
+from semslam.models.detectors.layout import (
+    centred_picture,
+    corners,
+    input_size,
+    known_sizes,
+    one_picture,
+    single,
+)
 from semslam.models.detectors.yolov8 import best_of_columns
 from semslam.models.detectors.yolov10 import read_selected
 from semslam.models.mask_grids import combined, masks_from_grids
@@ -51,9 +58,7 @@ class Yolov8Seg:
         self, rgb: NDArray[np.uint8], _depth_m: Floats | None, signature: Signature
     ) -> tuple[Mapping[str, Array], Letterbox]:
         """(1, 3, h, w) RGB, 0 to 1."""
-        height, width = input_size(signature)
-        canvas, box = fit(rgb, width, height)
-        return {signature.inputs[0].name: planes(canvas, UNIT)}, box
+        return centred_picture(rgb, signature)
 
     def postprocess(self, outputs: list[Array], look: Look, signature: Signature) -> Detections:
         """Boxes as ever; masks for those that remain."""

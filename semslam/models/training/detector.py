@@ -159,7 +159,7 @@ def assign(
     to the one it overlaps most. On objects too small or hidden to count, their own class is left out of the loss.
     """
     wanted, goal, used = torch.zeros_like(scores), torch.zeros_like(boxes), torch.ones_like(scores)
-    for inside, class_id in zip(_inside(centres, truth.ignored), truth.ignored_classes.tolist(), strict=True):
+    for inside, class_id in zip(inside_boxes(centres, truth.ignored), truth.ignored_classes.tolist(), strict=True):
         used[inside, class_id] = 0
     if not len(truth.boxes):
         return wanted, goal, used
@@ -181,13 +181,13 @@ def assign(
 
 def _eligible(centres: Tensor, strides: Tensor, boxes: Tensor) -> Tensor:
     """(G, cells) True where a centre lies in the box; of tiny boxes, where it lies within a stride of its middle."""
-    inside = _inside(centres, boxes)
+    inside = inside_boxes(centres, boxes)
     middles = (boxes[:, None, :2] + boxes[:, None, 2:]) / 2  # (G, 1, 2)
     near = ((centres[None] - middles).abs().amax(-1) < strides[None]) & (strides == STRIDES[0])
     return inside | (near & (inside.sum(1, keepdim=True) < _CANDIDATES // 2))
 
 
-def _inside(centres: Tensor, boxes: Tensor) -> Tensor:
+def inside_boxes(centres: Tensor, boxes: Tensor) -> Tensor:
     """(G, cells) True where the centre lies in the box."""
     low, high = centres[None] - boxes[:, None, :2], boxes[:, None, 2:] - centres[None]
     return torch.cat([low, high], -1).amin(-1) > 0

@@ -99,14 +99,31 @@ def _alone(folder: Path) -> Iterator[None]:
         raise SemslamError(f"`{folder}` is a file", hint="give another `--out`") from error
     descriptor = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _lock(descriptor, folder)
         yield
-    except BlockingIOError as error:
-        raise SemslamError(
-            f"Another training is at work in `{folder}`", hint="wait for it, or give another `--out`"
-        ) from error
     finally:
         os.close(descriptor)
+
+
+def _lock(descriptor: int, folder: Path) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        hint = "wait for it, or give another `--out`"
+        raise SemslamError(f"Another training is at work in `{folder}`", hint=hint) from error
+
+
+_Maker = Callable[[Run, torch.device, PictureSet, PictureSet | None], list[Path]]
+"""Trains and exports: a run, its device, the views to learn from, and those to judge on."""
+
+
+def _trained(run: Run, make: _Maker) -> list[Path]:
+    """Open everything that a run needs, then have it made while nobody else works in its folder."""
+    device = prepare(run)
+    pictures = PictureSet.open(run.data)
+    unseen = _unseen(run, pictures)
+    with _alone(run.out):
+        return make(run, device, pictures, unseen)
 
 
 def train_detector(run: Run) -> list[Path]:
@@ -115,11 +132,7 @@ def train_detector(run: Run) -> list[Path]:
     Raises:
         SemslamError: no views, a folder with another run, no such device.
     """
-    device = prepare(run)
-    pictures = PictureSet.open(run.data)
-    unseen = _unseen(run, pictures)
-    with _alone(run.out):
-        return _detector_made(run, device, pictures, unseen)
+    return _trained(run, _detector_made)
 
 
 def _detector_made(run: Run, device: torch.device, pictures: PictureSet, unseen: PictureSet | None) -> list[Path]:
@@ -147,11 +160,7 @@ def train_segmenter(run: Run) -> list[Path]:
     Raises:
         SemslamError: no views, a folder with another run, no such device.
     """
-    device = prepare(run)
-    pictures = PictureSet.open(run.data)
-    unseen = _unseen(run, pictures)
-    with _alone(run.out):
-        return _segmenter_made(run, device, pictures, unseen)
+    return _trained(run, _segmenter_made)
 
 
 def _segmenter_made(run: Run, device: torch.device, pictures: PictureSet, unseen: PictureSet | None) -> list[Path]:
