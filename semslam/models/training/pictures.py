@@ -105,6 +105,8 @@ class PictureSet:
             SemslamError: no views there, a damaged file, or files with different classes.
         """
         paths = sorted(folder.glob("*.parquet"))[homes]
+        if folder.is_file():
+            raise SemslamError(f"`{folder}` is a file", hint="name the folder that `semslam train pictures` made")
         if not paths:
             raise SemslamError(f"No views in `{folder}`", hint=f"make some: `semslam train pictures {folder}`")
         homes_read = [_home(path) for path in paths]
