@@ -1,11 +1,10 @@
-"""Step time of the paper's estimator against one bare ONNX Runtime convolution of the same size, in the same run.
+"""Equation 2 against one bare ONNX Runtime convolution of the same size, in the same run.
 
     python benchmarks/correlate.py [--quick]
 
-The baseline is the convolution alone: map (1, 10, 33, 33), kernels (360, 10, 11, 11), float32, zero padded. The
-estimator's step has that correlation in it, in exact arithmetic, and everything else too: pooling, rotating, softmax,
-modes, placing, map update. One thread each. `dense` has weight in every cell of every class; `room` has what a camera
-sees of one: four of ten classes, a few cells each.
+The baseline is the convolution alone: map (1, 10, 33, 33), kernels (360, 10, 11, 11), float32, zero padded, one thread.
+`dense` has weight in every cell of every class; `room` has what a camera sees of one: four of ten classes, a few cells
+each. benchmarks/paper_step.py measures the step of the estimator around it.
 """
 
 from __future__ import annotations
@@ -24,61 +23,66 @@ import onnx
 import onnxruntime
 from machine import machine
 
-from semslam.geometry.frames import SE2
 from semslam.geometry.grid import Planes, pool_observation
 from semslam.labels import FIRST_OBJECT, FREE_FLOOR, UNOBSERVED, class_list
-from semslam.slam.estimator import Step
+from semslam.models.memory import keep_freed_memory
 from semslam.slam.paper import correlate, rotate_observation
-from semslam.slam.registry import open_estimator
-from semslam.stages.settings import LocalizeConfig, PaperConfig
+from semslam.stages.settings import PaperConfig
 
 CELL_M, SIDE = 0.1, 99
 CLASSES = class_list([f"class {i}" for i in range(10)])
 PAPER = PaperConfig()
+SIZES = f"L = {len(CLASSES) - FIRST_OBJECT} object classes, h = {PAPER.side}, R = {PAPER.headings}"
 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="three rounds, to exercise the code")
-    rounds = 3 if parser.parse_args().quick else 40
+    rounds = rounds_wanted(__doc__ or "")
     print(machine("numpy", "onnxruntime"))
-    sizes = f"L = {len(CLASSES) - FIRST_OBJECT} object classes, h = {PAPER.side}, R = {PAPER.headings}"
-    print(f"{rounds} rounds, median; {sizes}")
-    print(f"{'case':6} {'convolution':>14} {'correlate':>14} {'whole step':>14}   ratio to the convolution")
+    print(f"{rounds} rounds, median; {SIZES}")
+    print(f"{'case':6} {'convolution':>14} {'correlate':>14}   ratio")
+    keep_freed_memory()
     for name, make in (("dense", dense_observation), ("room", room_observation)):
-        baseline, alone, whole = (statistics.median(times) * 1e3 for times in measure(make, rounds))
-        ratios = f"{alone / baseline:5.2f} {whole / baseline:5.2f}"
-        print(f"{name:6} {baseline:11.1f} ms {alone:11.1f} ms {whole:11.1f} ms   {ratios}")
+        baseline, alone = (statistics.median(times) * 1e3 for times in measure(make, rounds))
+        print(f"{name:6} {baseline:11.1f} ms {alone:11.1f} ms   {alone / baseline:5.2f}")
 
 
-def measure(make: Callable[[int], Planes], rounds: int) -> tuple[list[float], list[float], list[float]]:
-    """Seconds of convolution, correlation and whole step, taken in turns."""
-    estimator = open_estimator("paper", LocalizeConfig(paper=PAPER), CLASSES, CELL_M, SIDE)
-    convolve = _convolution()
-    times: tuple[list[float], list[float], list[float]] = ([], [], [])
-    for frame in range(rounds + 2):
-        belief = estimator.belief()
-        assert belief is not None
-        observation = make(frame)
-        rotated = rotate_observation(pool_observation(observation, 3, PAPER.side), PAPER.headings)
-        kernels = np.ascontiguousarray(rotated[:, FIRST_OBJECT:])
-        image = np.ascontiguousarray(belief.planes[None, FIRST_OBJECT:])
-        step = Step(frame, frame, observation, SE2(0.05, 0.0, 0.02) if frame else None)
-        for kept, action in zip(
-            times,
-            (
-                lambda image=image, kernels=kernels: convolve(image, kernels),
-                lambda rotated=rotated, belief=belief: correlate(rotated, belief.planes),
-                lambda step=step: estimator.step(step),
-            ),
-            strict=True,
-        ):
-            start = time.perf_counter()
-            action()
-            if frame >= 2:  # the first two fill caches
-                kept.append(time.perf_counter() - start)
+def rounds_wanted(text: str) -> int:
+    """How often to measure, from the command line."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="three rounds, to exercise the code")
+    return 3 if parser.parse_args().quick else 40
+
+
+def measure(make: Callable[[int], Planes], rounds: int) -> tuple[list[float], list[float]]:
+    """Seconds of convolution and correlation, taken in turns."""
+    convolve = bare_convolution()
+    world = pool_observation(make(0), 3, PAPER.map_side)
+    times: tuple[list[float], list[float]] = ([], [])
+    for seed in range(rounds + 2):
+        rotated = rotate_observation(pool_observation(make(seed), 3, PAPER.side), PAPER.headings)
+        actions = (convolution_of(convolve, rotated, world), lambda rotated=rotated: correlate(rotated, world))
+        for kept, action in zip(times, actions, strict=True):
+            seconds = timed(action)
+            if seed >= 2:  # the first two fill caches
+                kept.append(seconds)
     return times
+
+
+def timed(action: Callable[[], object]) -> float:
+    """Seconds that it takes."""
+    start = time.perf_counter()
+    action()
+    return time.perf_counter() - start
+
+
+def convolution_of(
+    convolve: Callable[[Planes, Planes], Planes], rotated: Planes, world: Planes
+) -> Callable[[], Planes]:
+    """The baseline's share of a step, with its inputs laid out beforehand."""
+    kernels = np.ascontiguousarray(rotated[:, FIRST_OBJECT:])
+    image = np.ascontiguousarray(world[None, FIRST_OBJECT:])
+    return lambda: convolve(image, kernels)
 
 
 def dense_observation(seed: int) -> Planes:
@@ -101,7 +105,7 @@ def room_observation(seed: int) -> Planes:
     return planes
 
 
-def _convolution() -> Callable[[Planes, Planes], Planes]:
+def bare_convolution() -> Callable[[Planes, Planes], Planes]:
     """ONNX Runtime's Conv with run-time weights, one thread."""
     helper, kind = onnx.helper, onnx.TensorProto.FLOAT
     node = helper.make_node("Conv", ["x", "w"], ["y"], pads=[PAPER.side // 2] * 4)

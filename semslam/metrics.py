@@ -54,17 +54,34 @@ class Score:
     de_worst_deg: float | None
 
 
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Errors of one track, keyframe by keyframe; equally long columns, keyframes without a pose left out."""
+
+    frames: NDArray[np.int64]
+    distance_m: _FLOATS
+    turn_deg: _FLOATS
+    """0 to 180."""
+
+
+def errors(truth: Track, estimate: Track) -> Errors:
+    """Errors of `estimate` at the keyframes that both tracks have."""
+    frames, true_rows, rows = np.intersect1d(truth.frames, estimate.frames, assume_unique=True, return_indices=True)
+    if not len(rows):
+        return Errors(frames, np.zeros(0), np.zeros(0))
+    expected, found = _from_first(truth, true_rows), _from_first(estimate, rows)
+    turn = np.degrees(np.abs(_wrapped(found[2] - expected[2])))
+    return Errors(frames, np.hypot(*(found[:2] - expected[:2])), turn)
+
+
 def score(truth: Track, estimate: Track) -> Score:
     """Errors of `estimate` at the keyframes of `truth`; keyframes without a pose lower the coverage, not the errors."""
-    _, true_rows, rows = np.intersect1d(truth.frames, estimate.frames, assume_unique=True, return_indices=True)
-    frames = len(truth.frames)
-    if len(rows) == 0:
+    found, frames = errors(truth, estimate), len(truth.frames)
+    if not len(found.frames):
         return Score(frames, 0.0, None, None, None, None)
-    expected, found = _from_first(truth, true_rows), _from_first(estimate, rows)
-    distance = np.hypot(*(found[:2] - expected[:2]))
-    turn = np.degrees(np.abs(_wrapped(found[2] - expected[2])))
-    errors = (distance.mean(), turn.mean(), distance.max(), turn.max())
-    return Score(frames, len(rows) / frames, *(float(error) for error in errors))
+    distance, turn = found.distance_m, found.turn_deg
+    summary = (distance.mean(), turn.mean(), distance.max(), turn.max())
+    return Score(frames, len(found.frames) / frames, *(float(error) for error in summary))
 
 
 def _from_first(track: Track, rows: NDArray[Any]) -> _FLOATS:
@@ -96,11 +113,25 @@ def chance(truth: Track, map_half_m: float = 4.95, seed: int = 0) -> Score:
     frames = len(truth.frames)
     if frames == 0:
         return Score(0, 0.0, None, None, None, None)
+    distance, turn = _random_errors(truth, map_half_m, seed)
+    worst = (float(errors.max(1).mean()) for errors in (distance, turn))
+    return Score(frames, 1.0, float(distance.mean()), float(turn.mean()), *worst)
+
+
+def chance_errors(truth: Track, map_half_m: float = 4.95, seed: int = 0) -> Errors:
+    """What `chance` scores at each keyframe, as the mean over its random tracks."""
+    if not len(truth.frames):
+        return Errors(truth.frames, np.zeros(0), np.zeros(0))
+    distance, turn = _random_errors(truth, map_half_m, seed)
+    return Errors(truth.frames, distance.mean(0), turn.mean(0))
+
+
+def _random_errors(truth: Track, map_half_m: float, seed: int) -> tuple[_FLOATS, _FLOATS]:
+    """Position errors in metres and heading errors in degrees of random tracks, (draws, frames) each."""
+    frames = len(truth.frames)
     expected = _from_first(truth, np.arange(frames))
     random = np.random.default_rng(seed)
     place = random.uniform(-map_half_m, map_half_m, (2, _DRAWS, frames))
-    distance = np.hypot(*(place - expected[:2, None]))  # (draws, frames)
     heading = random.uniform(-math.pi, math.pi, (_DRAWS, frames))
     turn = np.degrees(np.abs(_wrapped(heading - expected[2])))
-    worst = (float(errors.max(1).mean()) for errors in (distance, turn))
-    return Score(frames, 1.0, float(distance.mean()), float(turn.mean()), *worst)
+    return np.hypot(*(place - expected[:2, None])), turn

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semslam.geometry.frames import SE2
-from semslam.metrics import Score, Track, chance, score, standstill
+from semslam.metrics import Score, Track, chance, chance_errors, errors, score, standstill
 from semslam.slam.exchange import tum
 
 
@@ -41,6 +41,25 @@ def test_keyframes_without_a_pose_lower_the_coverage_only() -> None:
     result = score(truth, estimate)
     assert (result.frames, result.coverage) == (10, pytest.approx(0.2))
     assert result.ape_m == pytest.approx(0.5)
+
+
+def test_errors_keyframe_by_keyframe() -> None:
+    """Those of the keyframes that have a pose, under their numbers."""
+    truth = track_of({i: SE2(float(i), 0, 0) for i in range(4)})
+    found = errors(truth, track_of({0: SE2(0, 0, 0), 2: SE2(2, 3, math.pi / 2), 3: SE2(3, 0, -0.1)}))
+    assert found.frames.tolist() == [0, 2, 3]
+    assert found.distance_m.tolist() == pytest.approx([0.0, 3.0, 0.0])
+    assert found.turn_deg.tolist() == pytest.approx([0.0, 90.0, math.degrees(0.1)])
+    assert len(errors(truth, track_of({})).frames) == 0
+
+
+def test_chance_keyframe_by_keyframe_has_the_same_mean() -> None:
+    """It grows with the distance from the middle of the map."""
+    truth = track_of({i: SE2(0.5 * i, 0, 0) for i in range(8)})
+    found, whole = chance_errors(truth), chance(truth)
+    assert found.distance_m.mean() == pytest.approx(whole.ape_m)
+    assert found.turn_deg.mean() == pytest.approx(whole.de_deg)
+    assert found.distance_m[7] > found.distance_m[0] + 0.5
 
 
 def test_nothing_in_common_has_no_errors() -> None:

@@ -13,12 +13,18 @@ from semslam.errors import SemslamError
 from semslam.geometry.frames import SE2
 from semslam.geometry.grid import to_dense
 from semslam.labels import UNOBSERVED
-from semslam.slam.estimator import Step
+from semslam.models import builtin
+from semslam.models.builtin import with_shipped
+from semslam.slam.dead_reckoning import DeadReckoning
+from semslam.slam.estimator import PoseEstimate, Step, View
+from semslam.slam.registry import NAMES as REGISTERED
+from semslam.slam.registry import NEEDS_VIEWS, open_estimator
 from semslam.stages import localize
 from semslam.stages.contract import FinishedShard
-from semslam.stages.settings import LocalizeConfig, PaperConfig
+from semslam.stages.settings import DeepVoConfig, LocalizeConfig, MapNetConfig, OrbConfig, PaperConfig
 from semslam.tables.parquet import TableFiles, write_table
-from semslam.tables.spec import CELLS, MOTION, OBSERVATIONS, POSES, SNAPSHOTS
+from semslam.tables.pictures import encode_colour, encode_depth
+from semslam.tables.spec import CELLS, FRAMES, MOTION, OBSERVATIONS, POSES, SNAPSHOTS
 from tests.slam_world import CELL_M, CLASSES, SIDE, MemoryContext, make_steps, make_walk, make_world, write_inputs
 
 PAPER = PaperConfig(headings=36, temperature=0.01, gate_distance_m=0.6, gate_heading_rad=0.3)
@@ -284,3 +290,124 @@ def test_a_cell_outside_the_observation_is_refused_by_frame(tmp_path: Path) -> N
     context.tables = {MOTION.name: context.tables["motion"], OBSERVATIONS.name: TableFiles(OBSERVATIONS, [path])}
     with pytest.raises(SemslamError, match="frame 0"):
         localize.run(context)
+
+
+def frame_rows(steps: list[Step]) -> dict[str, list[Any]]:
+    """The frames table of a walk; keyframe 3 is missing. The pictures tell their keyframe's number."""
+    frames = [step.frame for step in steps if step.frame != 3]
+    camera = {"fx": 50.0, "fy": 51.0, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48}
+    camera |= {"log_time_nanos": 0, "depth_offset_nanos": 0, "camera_height_m": 1.2, "height_source": "tf"}
+    camera |= {"roll_rad": 0.0, "pitch_rad": 0.0, "level_source": "tf", "robot_from_camera": np.eye(4).ravel().tolist()}
+    pictures = [encode_colour(np.full((48, 64, 3), 10 * frame, np.uint8)) for frame in frames]
+    depths = [encode_depth(np.full((48, 64), 0.5 + frame, np.float32)) for frame in frames]
+    columns: dict[str, list[Any]] = {name: [what] * len(frames) for name, what in camera.items()}
+    return {**columns, "frame": frames, "stamp_nanos": frames, "colour": pictures, "depth": depths}
+
+
+class Watcher(DeadReckoning):
+    """Dead reckoning that remembers what it was shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.views: dict[int, View | None] = {}
+
+    def step(self, step: Step) -> PoseEstimate:
+        self.views[step.frame] = step.view
+        return super().step(step)
+
+
+def watched_run(folder: Path, monkeypatch: pytest.MonkeyPatch, variant: str, finished: int = 0) -> Watcher:
+    """A run of six keyframes, four a shard, in which a watcher stands for the variant's estimator."""
+    steps, watcher = walk_steps(6), Watcher()
+    monkeypatch.setattr(localize, "open_estimator", lambda *_: watcher)
+    context = make_context(folder, steps, variant)
+    if variant in NEEDS_VIEWS:
+        write_table(folder / "frames.parquet", FRAMES, frame_rows(steps))
+        context.tables = {**context.tables, FRAMES.name: TableFiles(FRAMES, [folder / "frames.parquet"])}
+    if finished:
+        localize.run(context)
+        shard = context.folder / "shard-1"
+        for file in shard.iterdir():
+            file.unlink()
+        shard.rmdir()
+        context.finished = (FinishedShard(0, {}, {}, context.folder / "shard-0"),)
+        watcher.views.clear()
+    localize.run(context)
+    return watcher
+
+
+@pytest.mark.parametrize("variant", NEEDS_VIEWS)
+def test_estimators_of_pictures_see_their_keyframes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str
+) -> None:
+    """Colour, depth and camera of the keyframe itself; none where the table has none."""
+    watcher = watched_run(tmp_path, monkeypatch, variant)
+    assert list(watcher.views) == list(range(6))
+    assert watcher.views[3] is None
+    for frame in (0, 1, 2, 4, 5):
+        view = watcher.views[frame]
+        assert view is not None
+        assert view.rgb.shape == (48, 64, 3)
+        assert (view.rgb == 10 * frame).all()
+        np.testing.assert_allclose(view.depth_m, 0.5 + frame)
+        assert (view.fx, view.fy, view.cx, view.cy) == (50.0, 51.0, 31.5, 23.5)
+        np.testing.assert_array_equal(view.robot_from_camera, np.eye(4))
+
+
+def test_a_run_that_goes_on_shows_the_right_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second shard begins with keyframe 4."""
+    watcher = watched_run(tmp_path, monkeypatch, "mapnet", finished=1)
+    assert list(watcher.views) == [4, 5]
+    view = watcher.views[4]
+    assert view is not None
+    assert (view.rgb == 40).all()
+
+
+def test_other_estimators_cost_no_decoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They get no views, and the frames table is not even opened (here there is none)."""
+    watcher = watched_run(tmp_path, monkeypatch, "paper")
+    assert set(watcher.views.values()) == {None}
+
+
+def test_a_task_depends_on_the_settings_of_its_own_estimator_alone() -> None:
+    """Else another network for MapNet would make every estimator's tracks anew."""
+    changed = replace(
+        CONFIG,
+        mapnet=MapNetConfig("m.onnx"),
+        deepvo=DeepVoConfig("d.onnx"),
+        orb_rgbd=OrbConfig(features=500),
+        paper=replace(PAPER, leak=0.7),
+    )
+    own = {"paper": "paper", "paper_visual": "paper", "mapnet": "mapnet", "deepvo": "deepvo", "orb_rgbd": "orb_rgbd"}
+    plain = LocalizeConfig(shard_frames=CONFIG.shard_frames, snapshot_every=CONFIG.snapshot_every)
+    for name in REGISTERED:
+        section = own.get(name)
+        expected = replace(plain, estimators=(name,), **({section: getattr(changed, section)} if section else {}))
+        assert changed.for_variant(name) == expected
+
+
+def test_shipped_networks_are_named_where_they_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cache key holds what a setting names, so an empty one must become the file that will be opened."""
+    for name in ("map_update", "mapnet", "deepvo"):
+        (tmp_path / f"{name}.onnx").touch()
+    monkeypatch.setattr(builtin, "FOLDER", tmp_path)
+    learned = LocalizeConfig(paper=replace(PAPER, update="learned"))
+    assert with_shipped(learned.for_variant("paper")).paper.model == str(tmp_path / "map_update.onnx")
+    assert with_shipped(learned.for_variant("mapnet")).mapnet.model == str(tmp_path / "mapnet.onnx")
+    assert with_shipped(learned.for_variant("deepvo")).deepvo.model == str(tmp_path / "deepvo.onnx")
+    assert with_shipped(CONFIG.for_variant("paper")) == CONFIG.for_variant("paper")
+    assert with_shipped(learned.for_variant("dead_reckoning")) == learned.for_variant("dead_reckoning")
+    named = LocalizeConfig(mapnet=MapNetConfig("mine.onnx")).for_variant("mapnet")
+    assert with_shipped(named) == named
+
+
+@pytest.mark.parametrize("name", ["mapnet", "deepvo"])
+def test_an_estimator_without_its_network_says_how_to_name_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """Where this package ships none."""
+    monkeypatch.setattr(builtin, "FOLDER", tmp_path)
+    with pytest.raises(SemslamError) as caught:
+        open_estimator(name, LocalizeConfig(), CLASSES, CELL_M, SIDE)
+    assert f"`localize.{name}.model` is empty" in caught.value.message
+    assert f"--set localize.{name}.model=FILE.onnx" in caught.value.hint

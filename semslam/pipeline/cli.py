@@ -557,7 +557,7 @@ def config_check(context: click.Context, file: Path) -> None:
 
 @cli.group()
 def train() -> None:
-    """Make training pictures, and train semslam's own detector and segmenter.
+    """Make training pictures, and train semslam's own networks.
 
     \b
     Example:
@@ -671,6 +671,114 @@ def train_segmenter(**given: Any) -> int:
       semslam train segmenter views --out runs/segmenter
     """
     return _train("segmenter", given)
+
+
+@train.command("mapper")
+@click.argument("dataset", type=click.Path(path_type=Path))
+@click.option("--run", "run_folder", type=click.Path(path_type=Path), help="Output folder of a run over its logs.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the training.")
+@click.option("--quality", type=click.Choice(("real", "obstructed", "ideal")), default="real", show_default=True)
+@click.option("--protocol", type=click.Choice(("cross", "intra")), default="cross", show_default=True)
+@click.option("--kernel", type=click.Choice(("3", "1")), default="3", show_default=True, help="1: an LSTM a cell.")
+@click.option("--side", type=click.IntRange(3), default=11, show_default=True, help="Cells of an observation; odd.")
+@click.option("--binary", is_flag=True, help="Observation cells above the noise floor count as 1.")
+@click.option(
+    "--own", type=click.FloatRange(0, 1), default=0.5, show_default=True, help="Share of own poses at the end."
+)
+@click.option("--steps", type=click.IntRange(1), help="Default: as the shipped model.")
+@click.option("--batch", type=click.IntRange(1), help="Drives a step. Default: as the shipped model.")
+@click.option("--rate", type=click.FloatRange(0, min_open=True), help="Peak learning rate. Default: likewise.")
+@click.option("--seed", type=_SEED, default=1, show_default=True, help="Of everything random.")
+@click.option("--threads", type=click.IntRange(1, 64), default=1, show_default=True, help="Of torch.")
+@click.option("--device", type=click.Choice(("auto", "cpu", "cuda")), default="auto", show_default=True)
+@click.option("--quiet", is_flag=True, help="Only warnings and errors.")
+def train_mapper(**given: Any) -> int:
+    """Train the map update (equation 8) on the drives of DATASET and export it as ONNX.
+
+    DATASET is a folder of `semslam simulate`. Real-camera observations and motion come from a run over its logs;
+    without one, train on its own qualities with true poses. The training's folder holds a checkpoint: killed, the same
+    command goes on where it was; `curves.csv` has the losses. Needs `pip install 'semslam[train]'`.
+
+    \b
+    Example:
+      semslam run homes/logs --out out
+      semslam train mapper homes --run out --out runs/mapper
+    """
+    from semslam.models.extras import require_torch
+
+    require_torch()
+    from semslam.pipeline.train_mapper import MapperRequest, train_on_drives
+
+    console = _console(quiet=given.pop("quiet"))
+    for path in train_on_drives(console, MapperRequest(**given)):
+        console.say(f"wrote {path}")
+    return 0
+
+
+@cli.group()
+def bench() -> None:
+    """Measure again what was claimed.
+
+    \b
+    Example:
+      semslam bench paper homes --out out/paper
+    """
+
+
+@bench.command("paper")
+@click.argument("dataset", type=click.Path(path_type=Path), required=False)
+@click.option("--out", type=click.Path(path_type=Path), default=Path("bench_paper"), show_default=True, help="Folder.")
+@click.option("--rows", multiple=True, metavar="NAME", help="Row of a table, `maps` (table 4) or `noise`; repeatable.")
+@click.option("--seeds", type=click.IntRange(1, 100), default=3, show_default=True, help="Trainings of each network.")
+@click.option("--steps", type=click.IntRange(2), default=30, show_default=True, help="Keyframes scored of a drive.")
+@click.option("--run", type=click.Path(path_type=Path), help="Output folder of a run over its logs, to build on.")
+@click.option("--device", type=click.Choice(("cpu", "cuda")), default="cpu", show_default=True, help="Of trainings.")
+@click.option("--quick", is_flag=True, help="Try every path on two tiny homes; the figures mean nothing.")
+@click.option("--config", "config_file", type=click.Path(path_type=Path), help="TOML configuration file.")
+@click.option("--set", "assignments", multiple=True, metavar="KEY=VALUE", help="Set one key; repeatable.")
+@click.option("--workers", type=click.IntRange(0), help="Processes; 0: none but this. Default: by processors.")
+@_json_option
+@click.option("--quiet", is_flag=True, help="Only warnings and errors.")
+@click.pass_context
+def bench_paper_command(
+    context: click.Context, /, dataset: Path | None, out: Path, as_json: bool, quiet: bool, **given: Any
+) -> None:
+    """Regenerate the paper's tables and figures on DATASET, beside its own figures.
+
+    DATASET is a folder of `semslam simulate`; --quick makes a tiny one if none is named. OUT/results/README.md holds
+    it all. Killed, the same command goes on where it was. What cannot be run is listed with the reason. Needs
+    `pip install 'semslam[report]'`, and for its networks `[train]`.
+
+    \b
+    Example:
+      semslam simulate homes && semslam bench paper homes --out out/paper
+      semslam bench paper --quick
+    """
+    from semslam.bench.paper import bench_paper
+    from semslam.bench.work import BenchRequest
+
+    if dataset is None and not given["quick"]:
+        raise UsageError("No data set was named", hint="make one with `semslam simulate homes`, or add `--quick`")
+    console = _console(quiet=quiet)
+    request = BenchRequest(dataset or _tiny_homes(out / "homes", given["workers"], console), out, **given)
+    report = bench_paper(request, _stages(context), console)
+    if as_json:
+        _print_json(report.as_json())
+
+
+def _tiny_homes(folder: Path, workers: int | None, console: Console) -> Path:
+    """Two homes with two short drives each, as a data set."""
+    from semslam.sim.dataset import Recipe
+    from semslam.sim.engine import require_engine
+    from semslam.sim.simulate import simulate as make
+
+    require_engine()
+    console.say(f"simulate two tiny homes in {folder}")
+    report = make(folder, Recipe(scenes=2, trajectories=2, steps=4, width=160, height=120), workers=workers)
+    if report.failures:
+        logs = ", ".join(f"`{one.recording.name}`" for one in report.failures)
+        raise SemslamError(f"Of the tiny homes {logs} could not be simulated", hint="`semslam simulate` says why")
+    return folder
 
 
 @cli.group()

@@ -44,9 +44,7 @@ class Config:
     def for_variant(self, stage: Stage, variant: str) -> Any:
         """The configuration of one task of the stage, with the shipped models that it may use named."""
         section = self.of(stage)
-        if isinstance(section, ExtractConfig):
-            return with_shipped(section)
-        return section.for_variant(variant) if stage.variants else section
+        return with_shipped(section.for_variant(variant) if stage.variants else section)
 
     def as_json(self) -> dict[str, Any]:
         """Plain values, with paths as they are."""

@@ -85,10 +85,13 @@ def _check_extract(config: Config) -> None:
 
 
 def _check_localize(config: Config) -> None:
-    """Whether the paper's cells can be made from those of extract."""
+    """Whether the paper's cells can be made from those of extract, and the networks of all estimators are there."""
     from semslam.slam.paper_estimator import pooling_factor
+    from semslam.slam.registry import model_of
 
     section, extract = config.of(LOCALIZE), config.of(EXTRACT)
+    for name in section.estimators:
+        model_of(name, section)
     if any(name.startswith("paper") for name in section.estimators):
         pooling_factor(section.paper, extract.cell_m, extract.side)
 

@@ -63,6 +63,17 @@ class PicturesView(_View):
         self.show(done, homes)
 
 
+class LogsView(_View):
+    """Logs of a data set being read."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(console, "log")
+
+    def progressed(self, done: int, logs: int) -> None:
+        """So many logs are read."""
+        self.show(done, logs)
+
+
 class TrainingView(_View):
     """A network being trained."""
 

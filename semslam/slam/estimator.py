@@ -8,7 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from semslam.geometry.frames import SE2
+import numpy as np
+from numpy.typing import NDArray
+
+from semslam.geometry.frames import SE2, Matrix
 from semslam.geometry.grid import Planes
 
 START = "start"
@@ -22,6 +25,23 @@ NONE = "none"
 
 
 @dataclass(frozen=True)
+class View:
+    """The pictures of a keyframe and where the camera was, as in the frames table."""
+
+    rgb: NDArray[np.uint8]
+    """(H, W, 3)"""
+    depth_m: NDArray[np.float32]
+    """(H, W) along the optical axis, 0 where missing."""
+    fx: float
+    """Focal lengths and principal point, pixels; the centre of the first pixel is 0."""
+    fy: float
+    cx: float
+    cy: float
+    robot_from_camera: Matrix
+    """(4, 4), levelled robot frame from optical camera frame."""
+
+
+@dataclass(frozen=True)
 class Step:
     """What is known at one keyframe."""
 
@@ -31,6 +51,8 @@ class Step:
     """(L, side, side) as in the observations table; None if the keyframe has none."""
     motion: SE2 | None
     """previous_from_current robot frame (u_t); None if unknown, and ignored at the first keyframe."""
+    view: View | None = None
+    """None for estimators that do not ask for views (registry.NEEDS_VIEWS), and where the keyframe has none."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The paper's estimator, step by step: look (2), check against the motion (3, 4), place (5, 6), update (7, 10).
+"""The paper's estimator, step by step: look (2), check against the motion (3, 4), place (5, 6), update (7, 8 or 10).
 
 What the paper leaves open:
 
@@ -14,9 +14,13 @@ What the paper leaves open:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semslam.errors import SemslamError
 from semslam.geometry.frames import SE2
@@ -27,6 +31,7 @@ from semslam.slam.estimator import INERTIAL, NONE, START, VISUAL, Belief, Mode, 
 from semslam.slam.paper import (
     Field,
     PoseGrid,
+    Window,
     best_bin,
     correlate,
     cross_check,
@@ -42,6 +47,50 @@ from semslam.slam.paper import (
 from semslam.stages.settings import PaperConfig
 
 
+class ClassMap(Protocol):
+    """The map m_t and how it takes up what is placed on it."""
+
+    @property
+    def planes(self) -> Planes:
+        """The map (L, H, W), the estimator's own: copy it before you keep it."""
+
+    def update(self, placed: Planes, window: Window) -> None:
+        """Take up what was placed (L, rows, columns) in the window; no other cell changes."""
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What the map remembers."""
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from `arrays`."""
+
+
+class LeakyMap:
+    """The heuristic map of equation 10, all of it unobserved at first."""
+
+    def __init__(self, classes: int, side: int, leak: float) -> None:
+        self._leak = leak
+        self._world: Planes = np.zeros((classes, side, side), np.float32)
+        self._world[UNOBSERVED] = 1.0
+
+    @property
+    def planes(self) -> Planes:
+        """The map m_t; *unobserved* is 1 where nothing was ever placed."""
+        return self._world
+
+    def update(self, placed: Planes, window: Window) -> None:
+        """Equation 10 in the window, at a cost that does not depend on the rest of the map."""
+        part = self._world[:, window[0], window[1]]
+        part[:] = update_map(part, placed, (slice(None), slice(None)), self._leak)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The map."""
+        return {"world": self._world}
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from `arrays`."""
+        self._world = arrays["world"]
+
+
 @dataclass(frozen=True)
 class _Sight:
     """What the visual half says about a keyframe."""
@@ -54,21 +103,32 @@ class _Sight:
 
 
 class PaperEstimator:
-    """Visual-inertial (`inertial=True`) or visual pose tracks by equations 2 to 7, with the map of equation 10."""
+    """Visual-inertial (`inertial=True`) or visual pose tracks by equations 2 to 7, with the map of equation 8 or 10."""
 
-    def __init__(self, config: PaperConfig, classes: int, cell_m: float, side: int, modes: int, inertial: bool) -> None:
-        """`cell_m` and `side` are those of the observations table; `classes` counts the reserved ones too.
+    def __init__(
+        self,
+        config: PaperConfig,
+        classes: tuple[str, ...],
+        cell_m: float,
+        side: int,
+        modes: int,
+        inertial: bool,
+        model: Path | None = None,
+    ) -> None:
+        """`cell_m`, `side` and `classes`, the reserved ones first, are those of the observations table.
+
+        `model` is the network of the learned update; None takes the leaky one.
 
         Raises:
-            SemslamError: the paper's grid cannot be made from the observations' cells.
+            SemslamError: the paper's grid cannot be made from the observations' cells, or the network is none, or was
+                trained for others.
         """
         self._config = config
         self._factor = pooling_factor(config, cell_m, side)
         self._grid = PoseGrid(config.headings, config.map_side, config.cell_m)
         self._modes = modes
         self._inertial = inertial
-        self._world: Planes = np.zeros((classes, config.map_side, config.map_side), np.float32)
-        self._world[UNOBSERVED] = 1.0
+        self._map = open_map(config, classes, model)
         self._last: SE2 | None = None
         self._lost = False
 
@@ -87,21 +147,22 @@ class PaperEstimator:
         return estimate
 
     def belief(self) -> Belief:
-        """The map m_t; *unobserved* is 1 where nothing was ever placed."""
+        """The map m_t."""
         origin = self._grid.origin_m
-        return Belief(self._world.copy(), self._grid.cell_m, origin, origin)
+        return Belief(self._map.planes.copy(), self._grid.cell_m, origin, origin)
 
     def state(self) -> bytes:
         """Map, last pose, and whether the track is lost."""
         last = self._last
         pose = np.array([] if last is None else [last.x_m, last.y_m, last.heading_rad])
-        return pack({"world": self._world, "last": pose, "lost": np.array(self._lost)})
+        return pack({**self._map.arrays(), "last": pose, "lost": np.array(self._lost)})
 
     def restore(self, state: bytes) -> None:
         """Go on from `state`."""
         arrays = unpack(state)
         last = arrays["last"].tolist()
-        self._world, self._lost = arrays["world"], bool(arrays["lost"])
+        self._map.restore(arrays)
+        self._lost = bool(arrays["lost"])
         self._last = SE2(*last) if last else None
 
     def _rotations(self, fine: Planes) -> Planes:
@@ -115,7 +176,7 @@ class PaperEstimator:
 
     def _look(self, rotated: Planes, near: SE2) -> _Sight:
         """Equation 2: the visual pose field and what it says."""
-        scores = correlate(rotated, self._world)
+        scores = correlate(rotated, self._map.planes)
         matched = bool(scores.max() > 0.0)
         field, entropy = visual_field(scores, self._config.temperature)
         best = best_bin(scores, near, self._grid)
@@ -135,10 +196,10 @@ class PaperEstimator:
         return cross_check(visual, inertial, config.gate_distance_m, config.gate_heading_rad, config.gate)
 
     def _update(self, rotated: Planes, pose: SE2, field: Field | None) -> None:
-        """Equations 5 to 7 and 10; without a field the pose alone counts."""
+        """Equations 5 to 8 or 10; without a field the pose alone counts."""
         window = roi_mask(pose, self._grid, self._config.side)
         placed = place_observation(rotated, pose_field(pose, self._grid) if field is None else field, window)
-        self._world = update_map(self._world, placed, window, self._config.leak)
+        self._map.update(placed, window)
 
     def _remember(self, estimate: PoseEstimate) -> None:
         if estimate.map_from_robot is None:
@@ -158,6 +219,19 @@ def _report(pose: SE2 | None, source: str, sight: _Sight | None) -> PoseEstimate
     if sight is None:
         return PoseEstimate(pose, source)
     return PoseEstimate(pose, source, float(sight.field.max()), sight.entropy_nats, sight.modes)
+
+
+def open_map(config: PaperConfig, classes: tuple[str, ...], model: Path | None) -> ClassMap:
+    """An empty map: learned if there is a network for it, else leaky.
+
+    Raises:
+        SemslamError: the network is none, or was trained for other observations.
+    """
+    if model is None:
+        return LeakyMap(len(classes), config.map_side, config.leak)
+    from semslam.slam.learned_map import LearnedMap  # with ONNX Runtime, which dead reckoning does without
+
+    return LearnedMap.open(model, classes, config.map_side, config.cell_m, config.side)
 
 
 def pooling_factor(config: PaperConfig, cell_m: float, side: int) -> int:

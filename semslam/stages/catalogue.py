@@ -42,13 +42,13 @@ EXTRACT = Stage(
 )
 LOCALIZE = Stage(
     "localize",
-    version=1,
+    version=2,
     config=LocalizeConfig,
-    reads=(MOTION, OBSERVATIONS),
+    reads=(FRAMES, MOTION, OBSERVATIONS),
     writes=(POSES, SNAPSHOTS, CELLS),
     entry="semslam.stages.localize:run",
     variants="estimators",
-    libraries=("numpy", "pyarrow"),
+    libraries=("numpy", "opencv-contrib-python-headless", "onnxruntime", "pyarrow"),
 )
 EXPORT = Stage(
     "export",

@@ -25,6 +25,7 @@ from semslam.geometry.projection import Landing, extent, land, observe_landed, p
 from semslam.labels import FIRST_OBJECT, RESERVED, UNOBSERVED, class_list
 from semslam.models.builtin import with_shipped
 from semslam.models.detectors import Detections, Detector
+from semslam.models.memory import keep_freed_memory
 from semslam.models.segmenters import Segmenter, open_segmenter
 from semslam.stages.contract import ShardWriter, StageContext, row_shards
 from semslam.stages.settings import ExtractConfig
@@ -38,8 +39,6 @@ T = TypeVar("T")
 
 _ROWS_READ = 8
 """Keyframes read at once; what lies in a table is small beside decoded pictures."""
-_KEPT_BYTES = 24 << 20
-"""Larger than any array of a keyframe, and below the 32 MiB up to which glibc learns."""
 
 
 def run(ctx: StageContext) -> None:
@@ -347,15 +346,6 @@ def ahead(items: Iterator[T]) -> Iterator[T]:
         while (item := coming.result()) is not None:
             coming = pool.submit(next, items, None)
             yield item
-
-
-def keep_freed_memory() -> None:
-    """Have the allocator keep what one keyframe frees for the next.
-
-    glibc returns blocks of a picture's size to the system at once, until one as large has been freed; to have them
-    anew, page by page, took a third of a keyframe's time outside the models. Elsewhere this does nothing.
-    """
-    np.empty(_KEPT_BYTES, np.uint8)
 
 
 def _rows(batches: Iterator[dict[str, list[Any]]]) -> Iterator[Row]:

@@ -1,6 +1,7 @@
 """Localize: from observations and motion to a pose track and maps, with the estimator that the variant names.
 
-Reads   motion         data_spec.md, table 3
+Reads   frames         data_spec.md, table 2, if the estimator looks at pictures
+        motion         data_spec.md, table 3
         observations   data_spec.md, table 6
 Writes  poses          data_spec.md, table 7
         snapshots      data_spec.md, table 8: the estimator's own map, or the map of cells so far if it keeps none
@@ -23,22 +24,30 @@ from semslam.errors import SemslamError
 from semslam.geometry.frames import SE2
 from semslam.geometry.grid import Planes, to_dense, to_sparse
 from semslam.labels import UNOBSERVED
+from semslam.models.memory import keep_freed_memory
 from semslam.slam.checkpoint import as_array, pack, unpack
-from semslam.slam.estimator import Belief, Estimator, PoseEstimate, Step
+from semslam.slam.estimator import Belief, Estimator, PoseEstimate, Step, View
 from semslam.slam.evidence import Evidence, Snapshot
 from semslam.slam.health import TrackHealth
-from semslam.slam.registry import WITHOUT_MOTION, open_estimator
+from semslam.slam.registry import NEEDS_VIEWS, WITHOUT_MOTION, open_estimator
 from semslam.stages.contract import FinishedShard, ShardWriter, StageContext, TableSource, row_shards
 from semslam.stages.settings import LocalizeConfig
-from semslam.tables.spec import CELLS, MOTION, OBSERVATIONS, POSES, SNAPSHOTS
+from semslam.tables.pictures import decode_colour, decode_depth
+from semslam.tables.spec import CELLS, FRAMES, MOTION, OBSERVATIONS, POSES, SNAPSHOTS
 
 _STATE = "state.npz"
+_VIEW = ["frame", "colour", "depth", "fx", "fy", "cx", "cy", "robot_from_camera"]
+"""Columns of the frames table that make a view."""
+_ROWS_READ = 8
+"""Rows read at once of tables whose rows are large."""
 
 
 def run(ctx: StageContext) -> None:
     """Step through all keyframes, shard by shard."""
     motion, observations = ctx.read(MOTION), ctx.read(OBSERVATIONS)
+    frames = ctx.read(FRAMES) if ctx.variant in NEEDS_VIEWS else None
     track = _Track(ctx, observations.meta)
+    keep_freed_memory()
     if ctx.finished:
         track.restore(ctx.finished[-1])
     for index, start, stop in row_shards(motion.rows, ctx.config.shard_frames):
@@ -46,7 +55,8 @@ def run(ctx: StageContext) -> None:
             continue
         with ctx.shard(index) as shard:
             tables = {table.name: shard.table(table, track.meta) for table in (POSES, SNAPSHOTS, CELLS)}
-            for done, step in enumerate(_steps(motion, observations, track.shape, start, stop), start + 1):
+            steps = _steps(motion, observations, frames, track.shape, start, stop)
+            for done, step in enumerate(steps, start + 1):
                 tables["poses"].append(_pose_row(step, track.step(step, shard)))
                 if done % ctx.config.snapshot_every == 0 or done == motion.rows:
                     tables["snapshots"].append(_snapshot_row(step, track.snapshot()))
@@ -137,27 +147,66 @@ class _Track:
 
 
 def _steps(
-    motion: TableSource, observations: TableSource, shape: tuple[int, int, int], start: int, stop: int
+    motion: TableSource,
+    observations: TableSource,
+    frames: TableSource | None,
+    shape: tuple[int, int, int],
+    start: int,
+    stop: int,
 ) -> Iterator[Step]:
-    """Motion rows [start, stop), each with the observation of its frame if there is one."""
-    rows = _rows(motion, start, stop)
-    first = next(rows, None)
-    if first is None:
-        return
-    frames = np.array(observations.read(["frame"])["frame"], np.int64)
-    sights = _rows(observations, int(np.searchsorted(frames, first["frame"])), None)
-    sight = next(sights, None)
-    for row in (first, *rows):
-        observation = None
-        if sight and sight["frame"] == row["frame"]:
-            observation, sight = _planes(sight, shape), next(sights, None)
-        yield Step(row["frame"], row["stamp_nanos"], observation, _motion(row))
+    """Motion rows [start, stop), each with the observation, and if wanted the view, of its frame if there is one."""
+    sights = _Beside(observations)
+    pictures = _Beside(frames, _VIEW) if frames else None
+    for row in _rows(motion, start, stop):
+        sight = sights.at(row["frame"])
+        picture = pictures.at(row["frame"]) if pictures else None
+        observation = None if sight is None else _planes(sight, shape)
+        view = None if picture is None else _view(picture)
+        yield Step(row["frame"], row["stamp_nanos"], observation, _motion(row), view)
 
 
-def _rows(table: TableSource, start: int, stop: int | None) -> Iterator[dict[str, Any]]:
-    for batch in table.batches(start=start, stop=stop):
+class _Beside:
+    """The rows of a table by frame number, asked for in rising order."""
+
+    def __init__(self, table: TableSource, columns: list[str] | None = None) -> None:
+        self._table = table
+        self._columns = columns
+        self._frames = np.array(table.read(["frame"])["frame"], np.int64)
+        self._rows: Iterator[dict[str, Any]] | None = None
+        self._row: dict[str, Any] | None = None
+
+    def at(self, frame: int) -> dict[str, Any] | None:
+        """The row of the frame; None if there is none."""
+        if self._rows is None:
+            first = int(np.searchsorted(self._frames, frame))
+            self._rows = _rows(self._table, first, None, self._columns)
+            self._row = next(self._rows, None)
+        if self._row is None or self._row["frame"] != frame:
+            return None
+        found, self._row = self._row, next(self._rows, None)
+        return found
+
+
+def _rows(
+    table: TableSource, start: int, stop: int | None, columns: list[str] | None = None
+) -> Iterator[dict[str, Any]]:
+    for batch in table.batches(columns, start, stop, _ROWS_READ):
         for values in zip(*batch.values(), strict=True):
             yield dict(zip(batch, values, strict=True))
+
+
+def _view(row: Mapping[str, Any]) -> View:
+    """The keyframe's pictures, decoded.
+
+    Raises:
+        SemslamError: one cannot be decoded.
+    """
+    return View(
+        rgb=decode_colour(row["colour"]),
+        depth_m=decode_depth(row["depth"]),
+        **{name: row[name] for name in ("fx", "fy", "cx", "cy")},
+        robot_from_camera=np.array(row["robot_from_camera"], np.float64).reshape(4, 4),
+    )
 
 
 def _motion(row: Mapping[str, Any]) -> SE2 | None:

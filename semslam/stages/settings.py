@@ -136,8 +136,60 @@ class PaperConfig:
     """Largest heading difference, radians: 3 sigma of a step's noise (0.08 rad) and half a degree of bias. gamma_2."""
     gate: str = setting("all", choices=("all", "any"))
     """Accept the visual pose if all, or any, of the two differences are below their gates (equation 4 says all)."""
+    update: str = setting("leaky", choices=("leaky", "learned"))
+    """How the map takes up what was placed on it: the leaky average (equation 10) or a network (equation 8)."""
     leak: float = setting(0.3, low=0.0, high=1.0)
-    """Weight of a new observation in the heuristic map. alpha of equation 10."""
+    """With update = "leaky": weight of a new observation in the map. alpha of equation 10."""
+    model: str = setting("", file=True)
+    """With update = "learned": ONNX file of the network; empty takes the shipped one."""
+
+
+@dataclass(frozen=True)
+class MapNetConfig:
+    """MapNet (Henriques and Vedaldi, 2018): image features on a grid, matched with a map of them."""
+
+    model: str = setting("", file=True)
+    """ONNX file of the network, which brings its own grid; empty takes the shipped one."""
+
+
+@dataclass(frozen=True)
+class DeepVoConfig:
+    """DeepVO (Wang et al., 2017): motion from pairs of pictures by a recurrent network."""
+
+    model: str = setting("", file=True)
+    """ONNX file of the network; empty takes the shipped one."""
+
+
+@dataclass(frozen=True)
+class OrbConfig:
+    """Keypoint SLAM after ORB-SLAM2 (Mur-Artal and Tardos, 2017) on colour and depth; it uses no motion."""
+
+    features: int = setting(1000, low=50, high=10000)
+    """Keypoints a picture, at most, spread over a grid."""
+    max_depth_m: float = setting(10.0, low=0.1, high=1000.0)
+    """Farther depth makes no map point, metres."""
+    min_matches: int = setting(15, low=4, high=10000)
+    """Fewer matches with the map than this and the frame has no pose."""
+    min_inliers: int = setting(10, low=4, high=10000)
+    """Fewer matches than this that agree with the pose and the frame has no pose."""
+    map_inliers: int = setting(30, low=4, high=10000)
+    """Points of the local map that must agree with a pose at last, or the frame is looked for in all keyframes."""
+    relocalise_inliers: int = setting(50, low=4, high=10000)
+    """Likewise for a frame that was looked for in all keyframes, or it has no pose."""
+    ratio: float = setting(0.8, low=0.1, high=1.0)
+    """A match counts if its descriptor distance is below this share of the second best's."""
+    inlier_px: float = setting(3.0, low=0.1, high=100.0)
+    """Largest reprojection error of an inlier at the finest pyramid level, pixels."""
+    keyframe_share: float = setting(0.75, low=0.0, high=1.0)
+    """A frame that tracks fewer than this share of its reference keyframe's points becomes a keyframe."""
+    local_keyframes: int = setting(10, low=1, high=1000)
+    """Keyframes whose points make the local map."""
+    max_keyframes: int = setting(300, low=1, high=100000)
+    """Keyframes kept for relocalisation; the oldest goes first."""
+
+
+_PAPER = ("paper", "paper_visual")
+"""Estimators that share section `[localize.paper]`."""
 
 
 @dataclass(frozen=True)
@@ -145,11 +197,19 @@ class LocalizeConfig:
     """From observations and motion to poses and maps."""
 
     estimators: tuple[str, ...] = setting(
-        ("paper", "paper_visual", "dead_reckoning"), choices=("paper", "paper_visual", "dead_reckoning")
+        ("paper", "paper_visual", "dead_reckoning"),
+        choices=("paper", "paper_visual", "dead_reckoning", "mapnet", "deepvo", "orb_rgbd"),
     )
-    """Estimators to run; each gives its own track and map. paper is visual-inertial, paper_visual visual only."""
+    """Estimators to run; each gives its own track and map. paper is visual-inertial, paper_visual visual only; mapnet,
+    deepvo and orb_rgbd look at the pictures themselves and never at the motion."""
     paper: PaperConfig = field(default_factory=PaperConfig)
     """Section `[localize.paper]`."""
+    mapnet: MapNetConfig = field(default_factory=MapNetConfig)
+    """Section `[localize.mapnet]`."""
+    deepvo: DeepVoConfig = field(default_factory=DeepVoConfig)
+    """Section `[localize.deepvo]`."""
+    orb_rgbd: OrbConfig = field(default_factory=OrbConfig)
+    """Section `[localize.orb_rgbd]`."""
     snapshot_every: int = setting(10, low=1, high=100000)
     """Keyframes between two map snapshots; the last keyframe always has one."""
     modes: int = setting(5, low=1, high=100)
@@ -157,10 +217,21 @@ class LocalizeConfig:
     shard_frames: int = setting(200, low=1, high=100000)
     """Keyframes a shard: what a killed run loses at most."""
 
+    @property
+    def uses_map_update(self) -> bool:
+        """Whether any of the estimators opens the network of equation 8."""
+        return self.paper.update == "learned" and any(name in _PAPER for name in self.estimators)
+
     def for_variant(self, estimator: str) -> LocalizeConfig:
         """The configuration of one estimator alone, so that its cache key ignores the settings of the others."""
-        paper = self.paper if estimator.startswith("paper") else PaperConfig()
-        return replace(self, estimators=(estimator,), paper=paper)
+        return replace(
+            self,
+            estimators=(estimator,),
+            paper=self.paper if estimator in _PAPER else PaperConfig(),
+            mapnet=self.mapnet if estimator == "mapnet" else MapNetConfig(),
+            deepvo=self.deepvo if estimator == "deepvo" else DeepVoConfig(),
+            orb_rgbd=self.orb_rgbd if estimator == "orb_rgbd" else OrbConfig(),
+        )
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,17 @@ from semslam.models.nets.detector import INPUT_HEIGHT, INPUT_WIDTH, Detector, De
 from semslam.models.nets.segmenter import Segmenter
 from semslam.models.onnxfile import file_digest
 from semslam.models.training.detector import Batches, detection_loss
+from semslam.models.training.drives import DriveSet
 from semslam.models.training.export import export_onnx
 from semslam.models.training.judge import box_table, judged_detector, judged_segmenter, mask_table
+from semslam.models.training.mapping import (
+    MapperOptions,
+    judged,
+    new_map_update,
+    options_for,
+    score_table,
+    train_mapper,
+)
 from semslam.models.training.pictures import CLASSES, PictureSet
 from semslam.models.training.segmenter import PromptBatches, export_segmenter, mask_loss, new_segmenter
 from semslam.models.training.trainer import CHECKPOINT, Progress, Schedule, fit, read_checkpoint
@@ -242,6 +251,80 @@ def _judged(unseen: PictureSet | None, table: str) -> list[str]:
     if unseen is None:
         return ["Not judged: `--test VIEWS` was not given."]
     return [f"On {len(unseen):,} views of homes it has not seen (`{unseen.origin}`), objects that count:", table]
+
+
+def train_map_update(run: Run, drives: DriveSet, unseen: DriveSet | None, options: MapperOptions) -> list[Path]:
+    """Train a map update, export it and write its card. A run that was killed goes on where it was.
+
+    Args:
+        run: what is asked; `data` and `test` are not looked at.
+        drives: what to learn from.
+        unseen: what to judge the result on; None for no judgement.
+        options: what it is trained for.
+
+    Raises:
+        SemslamError: a folder with another run, no such device.
+    """
+    device = prepare(run)
+    chosen = options_for(drives, options)
+    with _alone(run.out):
+        path = train_mapper(drives, run.out, schedule=run.schedule, options=chosen, device=device.type, watch=run.watch)
+        network = new_map_update(len(drives.classes), chosen.kernel, 0)
+        network.load_state_dict(_averaged(run.out, "mapper", network))
+        network.eval()
+        table = score_table(judged(network, unseen, chosen)) if unseen else ""
+        write_card(
+            path,
+            "Map update of SemanticSLAM (equation 8)",
+            _ON_DRIVES,
+            _mapped(run, device, drives, chosen),
+            _mapped_worth(unseen, table),
+        )
+    return [path, path.with_suffix(".md")]
+
+
+_ON_DRIVES = (
+    "Trained on drives through simulated homes alone. It updates the region of interest of a semantic map from what "
+    "was placed there; `localize.paper.update = learned` runs it, on observations of the same classes, cells and side."
+)
+
+
+def _mapped(run: Run, device: torch.device, drives: DriveSet, options: MapperOptions) -> dict[str, Any]:
+    """What a map update is and how it came about, for its card."""
+    schedule, paper, classes = run.schedule, options.paper, len(drives.classes)
+    around = "r, c" if options.kernel == 1 else "r + 2, c + 2"
+    return {
+        "input": f"`placed` (1, {classes}, r, c), `hidden` (1, {classes}, {around}), `cell` (1, {classes}, r, c)",
+        "output": f"`new_hidden`, `new_cell` (1, {classes}, r, c)",
+        "classes": ", ".join(drives.classes),
+        "grid": f"cells of {paper.cell_m:g} m, observations of {paper.side} x {paper.side} cells",
+        "kernel": options.kernel,
+        "parameters": f"{parameters_of(new_map_update(classes, options.kernel, 0)):,}",
+        "data": f"{len(drives)} drives of `{drives.origin}`, quality {drives.quality}, digest {drives.digest}",
+        "poses": _posed(options),
+        "command": f"`{run.command} --device {device.type}`",
+        "seed": schedule.seed,
+        "steps": f"{schedule.steps:,} of {schedule.batch} drives",
+        "licence": "Apache-2.0, model and data",
+    }
+
+
+def _posed(options: MapperOptions) -> str:
+    if not options.own_share:
+        return "true ones alone"
+    return (
+        f"true ones for {options.teacher_share:.0%} of the steps, then own ones, up to {options.own_share:.0%} of them"
+    )
+
+
+def _mapped_worth(unseen: DriveSet | None, table: str) -> list[str]:
+    if unseen is None:
+        return ["Not judged: the protocol has no logs to test."]
+    text = (
+        f"On {len(unseen)} drives that test, with true poses; means over steps and over the cells that have been "
+        "inside a region of interest by then, against the class map visible by then:"
+    )
+    return [text, table]
 
 
 def exported_detector(out: Path, run: Path | None, seed: int | None, classes: Path | None) -> list[Path]:

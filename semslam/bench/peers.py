@@ -1,0 +1,199 @@
+"""Other people's packages on the same keyframes, each in a process of its own: a crash costs that log its coverage.
+
+Reads   frames, motion    data_spec.md, tables 2 and 3
+Gives   stamps and poses  of the robot in the frame of the first keyframe; keyframes without a pose are left out
+
+None of them is a dependency: `pip install small_gicp kiss-icp pyorbslam3`. pyorbslam3 also needs ORB-SLAM3's
+vocabulary, whose file its environment variable `PYORBSLAM3_VOCAB` names.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import islice, tee
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semslam.errors import SemslamError
+from semslam.geometry.frames import SE2, planar
+from semslam.geometry.projection import points_in_robot
+from semslam.tables.parquet import TableFiles
+from semslam.tables.pictures import decode_colour, decode_depth
+from semslam.tables.spec import FRAMES, MOTION
+
+TASK = "semslam.bench.peers:track"
+VERSION = 1
+TIMEOUT_S = 900.0
+_VOXEL_M, _REACH_M, _MAX_DEPTH_M, _NEIGHBOURS = 0.1, 0.5, 6.0, 20
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """One row of the frames table, decoded, with the motion since the one before."""
+
+    stamp_nanos: int
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    intrinsics: tuple[float, float, float, float]
+    robot_from_camera: Matrix
+    motion: SE2 | None
+
+    @property
+    def cloud(self) -> Matrix:
+        """(N, 3) points in the robot frame, as many as have depth up to 6 m."""
+        points = points_in_robot(self.depth_m, *self.intrinsics, self.robot_from_camera)
+        near = (self.depth_m > 0) & (self.depth_m < _MAX_DEPTH_M)
+        return np.ascontiguousarray(points[near], np.float64)
+
+
+Poses = Iterator[Matrix | None]
+"""first_from_robot (4, 4) of each keyframe, or None."""
+
+
+def installed(peer: str) -> bool:
+    """Whether the package of a peer can be imported."""
+    return find_spec(peer) is not None
+
+
+def version(peer: str) -> str:
+    """Version of the package of a peer."""
+    from importlib.metadata import version as installed_version
+
+    return installed_version(peer)
+
+
+def track(arguments: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Run a peer over the first keyframes of a log: peer, frames and motion (files of the tables), steps."""
+    whole = keyframes(*([Path(file) for file in arguments[name]] for name in ("frames", "motion")))
+    frames, theirs = tee(islice(whole, arguments["steps"]))
+    rows: dict[str, list[float]] = {name: [] for name in ("stamp_nanos", "x_m", "y_m", "heading_rad")}
+    for frame, pose in zip(frames, _PEERS[arguments["peer"]](theirs, folder), strict=True):
+        if pose is not None:
+            heading = float(np.arctan2(pose[1, 0], pose[0, 0]))
+            values = (frame.stamp_nanos, float(pose[0, 3]), float(pose[1, 3]), heading)
+            for name, value in zip(rows, values, strict=True):
+                rows[name].append(value)
+    return dict(rows)
+
+
+def keyframes(frames: list[Path], motion: list[Path]) -> Iterator[Keyframe]:
+    """All keyframes of a log."""
+    moved = TableFiles(MOTION, motion).read(["stamp_nanos", "dx_m", "dy_m", "dheading_rad"])
+    motions = dict(zip(moved["stamp_nanos"], zip(*(moved[n] for n in list(moved)[1:]), strict=True), strict=True))
+    for batch in TableFiles(FRAMES, frames).batches(batch_rows=4):
+        for values in zip(*batch.values(), strict=True):
+            row = dict(zip(batch, values, strict=True))
+            known = motions.get(row["stamp_nanos"], (None,))
+            yield Keyframe(
+                row["stamp_nanos"],
+                decode_colour(row["colour"]),
+                decode_depth(row["depth"]),
+                (row["fx"], row["fy"], row["cx"], row["cy"]),
+                np.array(row["robot_from_camera"], np.float64).reshape(4, 4),
+                None if None in known else SE2(*known),
+            )
+
+
+def _small_gicp(frames: Iterator[Keyframe], folder: Path) -> Poses:
+    """Motion, then GICP of the cloud against the points of all earlier ones; the robot stays on its floor."""
+    del folder
+    gicp = importlib.import_module("small_gicp")
+    pose, world = np.eye(4), np.zeros((0, 3))
+    for frame in frames:
+        cloud = frame.cloud
+        source, _ = gicp.preprocess_points(cloud, _VOXEL_M, num_neighbors=_NEIGHBOURS)
+        if len(world):
+            pose = pose @ _matrix(frame.motion or SE2(0.0, 0.0, 0.0))
+            target, tree = gicp.preprocess_points(world, _VOXEL_M, num_neighbors=_NEIGHBOURS)
+            found = gicp.align(target, source, tree, pose, max_correspondence_distance=_REACH_M, max_iterations=50)
+            pose = _matrix(planar(found.T_target_source)) if found.converged else pose
+        moved = cloud @ pose[:3, :3].T + pose[:3, 3]
+        world = gicp.voxelgrid_sampling(np.concatenate([world, moved]), _VOXEL_M / 2).points()[:, :3]
+        yield pose
+
+
+def _kiss_icp(frames: Iterator[Keyframe], folder: Path) -> Poses:
+    """Depth as if it were a scan, without motion."""
+    del folder
+    settings = importlib.import_module("kiss_icp.config").load_config(None)
+    settings.data.max_range, settings.data.min_range, settings.data.deskew = _MAX_DEPTH_M, 0.0, False
+    settings.mapping.voxel_size = 2 * _VOXEL_M
+    settings.registration.max_num_threads = 1
+    odometry = importlib.import_module("kiss_icp.kiss_icp").KissICP(settings)
+    for frame in frames:
+        odometry.register_frame(frame.cloud, np.zeros(0))
+        yield np.asarray(odometry.last_pose)
+
+
+def _pyorbslam3(frames: Iterator[Keyframe], folder: Path) -> Poses:
+    """ORB-SLAM3 in its RGB-D mode, settings as ORB-SLAM3's own TUM example has them."""
+    slam: Any = importlib.import_module("pyorbslam3")
+    try:
+        vocabulary = slam.vocabulary_path(download=False)
+    except FileNotFoundError as error:
+        raise SemslamError(
+            "pyorbslam3 has no vocabulary", hint="name ORBvoc.txt in the environment variable `PYORBSLAM3_VOCAB`"
+        ) from error
+    system, first = None, np.eye(4)
+    for frame in frames:
+        if system is None:
+            settings = folder / "orb_slam3.yaml"
+            settings.write_text(_orb_settings(frame))
+            system, first = slam.Slam(vocabulary, settings, slam.Sensor.RGBD), frame.robot_from_camera
+        found = system.track_rgbd(frame.rgb, frame.depth_m, frame.stamp_nanos * 1e-9)
+        yield first @ np.asarray(found.pose_wc) @ np.linalg.inv(frame.robot_from_camera) if found.pose_valid else None
+
+
+_PEERS: dict[str, Callable[[Iterator[Keyframe], Path], Poses]] = {
+    "small_gicp": _small_gicp,
+    "kiss_icp": _kiss_icp,
+    "pyorbslam3": _pyorbslam3,
+}
+
+
+def _matrix(pose: SE2) -> Matrix:
+    cosine, sine = np.cos(pose.heading_rad), np.sin(pose.heading_rad)
+    matrix = np.eye(4)
+    matrix[:2] = [[cosine, -sine, 0.0, pose.x_m], [sine, cosine, 0.0, pose.y_m]]
+    return matrix
+
+
+def _orb_settings(frame: Keyframe) -> str:
+    """Camera and thresholds in ORB-SLAM3's format."""
+    height, width = frame.depth_m.shape
+    camera = dict(zip(("fx", "fy", "cx", "cy"), frame.intrinsics, strict=True))
+    values: dict[str, Any] = {
+        "File.version": '"1.0"',
+        "Camera.type": '"PinHole"',
+        **{f"Camera1.{name}": f"{value:.6f}" for name, value in camera.items()},
+        **{f"Camera1.{name}": "0.0" for name in ("k1", "k2", "p1", "p2")},
+        "Camera.width": width,
+        "Camera.height": height,
+        "Camera.fps": 1,
+        "Camera.RGB": 1,
+        "Stereo.ThDepth": "40.0",
+        "Stereo.b": "0.0747",
+        "RGBD.DepthMapFactor": "1.0",
+        "ORBextractor.nFeatures": 1000,
+        "ORBextractor.scaleFactor": "1.2",
+        "ORBextractor.nLevels": 8,
+        "ORBextractor.iniThFAST": 20,
+        "ORBextractor.minThFAST": 7,
+        **{f"Viewer.{name}": "1.0" for name in _VIEWER},
+    }
+    return "%YAML:1.0\n---\n" + "".join(f"{name}: {value}\n" for name, value in values.items())
+
+
+_VIEWER = (
+    "KeyFrameSize", "KeyFrameLineWidth", "GraphLineWidth", "PointSize", "CameraSize", "CameraLineWidth",
+    "ViewpointX", "ViewpointY", "ViewpointZ", "ViewpointF",
+)  # fmt: skip
+"""What ORB-SLAM3 wants to know of a viewer that is not opened."""

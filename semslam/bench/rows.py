@@ -1,0 +1,136 @@
+"""What is compared: every row of the tables with the configuration it needs.
+
+A row is an estimator with settings of its own. A row with a network is trained for every protocol and seed; the file
+of the network then goes to `model_key`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from semslam.errors import UsageError
+
+PROTOCOLS = ("intra", "cross")
+QUALITIES = ("real", "obstructed", "ideal")
+LEAKS = (0.1, 0.3, 0.7, 1.0)
+CONVLSTM = "convlstm"
+NOISE_LEVELS = (0.0, 0.5, 1.0, 3.0)
+MAPS, NOISE = "maps", "noise"
+"""In the place of rows: table 4, and other levels of noise."""
+
+MAPPER = "mapper"
+"""The map update by ConvLSTM, 3 x 3 (equation 8)."""
+MAPPER_CELL = "mapper_cell"
+"""The same with an LSTM a cell, as MapNet has it."""
+MAPNET, DEEPVO = "mapnet", "deepvo"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method of a table of poses.
+
+    Attributes:
+        estimator: its name in `localize.estimators`; empty if no estimator of semslam makes its track.
+        settings: what it changes of the configuration, {"section.key": value}.
+        network: kind of network that is trained for it; empty for none.
+        model_key: setting that takes the network's file.
+        peer: name of the adapter in `peers` that makes its track.
+        note: what to know when reading its figures.
+    """
+
+    name: str
+    title: str
+    estimator: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    network: str = ""
+    model_key: str = ""
+    peer: str = ""
+    note: str = ""
+
+    @property
+    def reference(self) -> bool:
+        """Whether it needs neither estimator nor peer: chance and standing still."""
+        return not self.estimator and not self.peer
+
+
+_PAPER = "localize.paper"
+_LEARNED = {f"{_PAPER}.update": "learned"}
+
+
+def _learned(name: str, title: str, estimator: str, network: str) -> Row:
+    return Row(name, title, estimator, _LEARNED, network, f"{_PAPER}.model")
+
+
+def _variant(name: str, title: str, **settings: Any) -> Row:
+    return Row(name, title, "paper", {f"{_PAPER}.{key}": value for key, value in settings.items()})
+
+
+CHANCE = Row("chance", "Chance", note="uniform poses on the map, mean of many draws")
+STANDSTILL = Row("standstill", "Standing still", note="the first pose for ever")
+DEAD_RECKONING = Row("dead_reckoning", "Dead reckoning", "dead_reckoning", note="the motion u_t alone")
+
+TABLE_1 = (
+    CHANCE,
+    STANDSTILL,
+    DEAD_RECKONING,
+    Row("deepvo", "DeepVO", "deepvo", network=DEEPVO, model_key="localize.deepvo.model"),
+    Row("mapnet", "MapNet", "mapnet", network=MAPNET, model_key="localize.mapnet.model"),
+    Row("orb_rgbd", "ORB RGB-D", "orb_rgbd"),
+    _learned("visual", "SemanticSLAM, visual", "paper_visual", MAPPER),
+    _learned("visual_inertial", "SemanticSLAM, visual-inertial", "paper", MAPPER),
+    Row("visual_leaky", "Visual, leaky map", "paper_visual", note="equation 10 in the place of the ConvLSTM"),
+    Row("visual_inertial_leaky", "Visual-inertial, leaky map", "paper", note="likewise"),
+    Row("small_gicp", "small_gicp, scan to map", peer="small_gicp", note="motion and geometry, no semantics"),
+    Row("kiss_icp", "kiss-icp", peer="kiss_icp", note="depth as a scan, no motion"),
+    Row("pyorbslam3", "pyorbslam3", peer="pyorbslam3"),
+)
+ABLATION = ("mapnet", "semantic_cell", "visual", "visual_inertial")
+"""Rows of the ablation in their order: each adds one thing to the one before."""
+ABLATION_TITLES = ("MapNet", "+ semantic observations", "+ ConvLSTM", "+ IMU")
+_ABLATION_ONLY = (_learned("semantic_cell", "Visual, LSTM a cell", "paper_visual", MAPPER_CELL),)
+SETTINGS = (
+    _variant("gate_any", 'gate "any"', gate="any"),
+    _variant("gates_double", "gates twice as wide", gate_distance_m=0.6, gate_heading_rad=0.2),
+    _variant("gates_open", "gates open", gate_distance_m=1e6, gate_heading_rad=3.2),
+    _variant("h_33", "h = 33 cells", side=33),
+    _variant("r_8", "R = 8", headings=8),
+    _variant("r_120", "R = 120", headings=120),
+    _variant("binary", "binary observations", binary=True),
+    _variant("temperature", "temperature 0.1", temperature=0.1),
+)
+"""The visual-inertial method with a leaky map, one setting changed at a time: where its error comes from."""
+SETTINGS_BASE = "visual_inertial_leaky"
+
+NOISE_ROWS = ("dead_reckoning", "visual_inertial", "visual_inertial_leaky")
+"""Rows that use the motion."""
+CROSS_ONLY = frozenset(row.name for row in (*_ABLATION_ONLY, *SETTINGS))
+ALL = {row.name: row for row in (*TABLE_1, *_ABLATION_ONLY, *SETTINGS)}
+
+
+def protocols_of(row: Row) -> tuple[str, ...]:
+    """The protocols in which a row is run."""
+    return ("cross",) if row.name in CROSS_ONLY else PROTOCOLS
+
+
+def chosen_rows(names: Sequence[str]) -> tuple[Row, ...]:
+    """The rows of those names, in the tables' order; all for none. `maps` and `noise` are no rows.
+
+    Raises:
+        UsageError: there is no row of a name.
+    """
+    for name in names:
+        if name not in ALL and name not in (MAPS, NOISE):
+            raise UsageError(f"There is no row `{name}`", hint=f"choose from {', '.join((*ALL, MAPS, NOISE))}")
+    return tuple(row for name, row in ALL.items() if not names or name in names)
+
+
+def leaky_name(leak: float) -> str:
+    """Name of a heuristic map as a method of table 4."""
+    return f"leaky_{leak:.1f}"
+
+
+MAP_METHODS = (CONVLSTM, *map(leaky_name, LEAKS))
+MAP_TITLES = {CONVLSTM: "ConvLSTM", **{leaky_name(leak): f"leaky {leak:.1f}" for leak in LEAKS}}
+QUALITY_TITLES = {"real": "real camera", "obstructed": "obstructed", "ideal": "ideal"}
