@@ -603,25 +603,40 @@ def train_pictures(out: Path, workers: int | None, as_json: bool, quiet: bool, *
     return 1 if report.failures else 0
 
 
-def _training_options(command: _Command) -> _Command:
-    """Options of the commands that train."""
-    return _applied(
-        command,
-        (
-            click.argument("views", type=click.Path(path_type=Path)),
-            click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run."),
-            click.option("--test", type=click.Path(path_type=Path), help="Views of other homes, to judge the result."),
-            click.option("--steps", type=click.IntRange(1), help="Default: as the shipped model."),
-            click.option("--batch", type=click.IntRange(1), help="Pictures a step. Default: as the shipped model."),
-            click.option(
-                "--rate", type=click.FloatRange(0, min_open=True), help="Peak learning rate. Default: likewise."
-            ),
-            click.option("--seed", type=_SEED, default=1, show_default=True, help="Of everything random."),
-            click.option("--threads", type=click.IntRange(1, 64), default=2, show_default=True, help="Of torch."),
-            click.option("--device", type=click.Choice(("auto", "cpu", "cuda")), default="auto", show_default=True),
-            click.option("--quiet", is_flag=True, help="Only warnings and errors."),
-        )[::-1],
+def _schedule_options(unit: str, threads: int) -> tuple[Callable[..., Any], ...]:
+    """How long and how fast to train; `unit` is what a batch counts."""
+    return (
+        click.option("--steps", type=click.IntRange(1), help="Default: as the shipped model."),
+        click.option("--batch", type=click.IntRange(1), help=f"{unit} a step. Default: as the shipped model."),
+        click.option("--rate", type=click.FloatRange(0, min_open=True), help="Peak learning rate. Default: likewise."),
+        click.option("--seed", type=_SEED, default=1, show_default=True, help="Of everything random."),
+        click.option("--threads", type=click.IntRange(1, 64), default=threads, show_default=True, help="Of torch."),
+        click.option("--device", type=click.Choice(("auto", "cpu", "cuda")), default="auto", show_default=True),
+        click.option("--quiet", is_flag=True, help="Only warnings and errors."),
     )
+
+
+def _training_options(command: _Command) -> _Command:
+    """Options of the commands that train on views."""
+    own = (
+        click.argument("views", type=click.Path(path_type=Path)),
+        click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run."),
+        click.option("--test", type=click.Path(path_type=Path), help="Views of other homes, to judge the result."),
+    )
+    return _applied(command, (*own, *_schedule_options("Pictures", threads=2)))
+
+
+def _drives_options(unit: str, *own: Callable[..., Any]) -> Callable[[_Command], _Command]:
+    """Options of the commands that train on the drives of a data set, and a command's own ones among them."""
+    shared = (
+        click.argument("dataset", type=click.Path(path_type=Path)),
+        click.option(
+            "--run", "run_folder", type=click.Path(path_type=Path), help="Output folder of a run over its logs."
+        ),
+        click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the training."),
+        click.option("--protocol", type=click.Choice(("cross", "intra")), default="cross", show_default=True),
+    )
+    return lambda command: _applied(command, (*shared, *own, *_schedule_options(unit, threads=1)))
 
 
 def _train(task: str, given: dict[str, Any]) -> int:
@@ -674,24 +689,16 @@ def train_segmenter(**given: Any) -> int:
 
 
 @train.command("mapper")
-@click.argument("dataset", type=click.Path(path_type=Path))
-@click.option("--run", "run_folder", type=click.Path(path_type=Path), help="Output folder of a run over its logs.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the training.")
-@click.option("--quality", type=click.Choice(("real", "obstructed", "ideal")), default="real", show_default=True)
-@click.option("--protocol", type=click.Choice(("cross", "intra")), default="cross", show_default=True)
-@click.option("--kernel", type=click.Choice(("3", "1")), default="3", show_default=True, help="1: an LSTM a cell.")
-@click.option("--side", type=click.IntRange(3), default=11, show_default=True, help="Cells of an observation; odd.")
-@click.option("--binary", is_flag=True, help="Observation cells above the noise floor count as 1.")
-@click.option(
-    "--own", type=click.FloatRange(0, 1), default=0.5, show_default=True, help="Share of own poses at the end."
+@_drives_options(
+    "Drives",
+    click.option("--quality", type=click.Choice(("real", "obstructed", "ideal")), default="real", show_default=True),
+    click.option("--kernel", type=click.Choice(("3", "1")), default="3", show_default=True, help="1: an LSTM a cell."),
+    click.option("--side", type=click.IntRange(3), default=11, show_default=True, help="Cells of an observation; odd."),
+    click.option("--binary", is_flag=True, help="Observation cells above the noise floor count as 1."),
+    click.option(
+        "--own", type=click.FloatRange(0, 1), default=0.5, show_default=True, help="Share of own poses at the end."
+    ),
 )
-@click.option("--steps", type=click.IntRange(1), help="Default: as the shipped model.")
-@click.option("--batch", type=click.IntRange(1), help="Drives a step. Default: as the shipped model.")
-@click.option("--rate", type=click.FloatRange(0, min_open=True), help="Peak learning rate. Default: likewise.")
-@click.option("--seed", type=_SEED, default=1, show_default=True, help="Of everything random.")
-@click.option("--threads", type=click.IntRange(1, 64), default=1, show_default=True, help="Of torch.")
-@click.option("--device", type=click.Choice(("auto", "cpu", "cuda")), default="auto", show_default=True)
-@click.option("--quiet", is_flag=True, help="Only warnings and errors.")
 def train_mapper(**given: Any) -> int:
     """Train the map update (equation 8) on the drives of DATASET and export it as ONNX.
 
@@ -713,6 +720,54 @@ def train_mapper(**given: Any) -> int:
     for path in train_on_drives(console, MapperRequest(**given)):
         console.say(f"wrote {path}")
     return 0
+
+
+def _train_on_pictures(task: str, given: dict[str, Any]) -> int:
+    """Train a network that learns motion from pictures in a row, and say what came of it."""
+    from semslam.models.extras import require_torch
+
+    require_torch()
+    from semslam.pipeline.train_request import DrivesRequest
+    from semslam.pipeline.train_sequences import train_sequences
+
+    console = _console(quiet=given.pop("quiet"))
+    for path in train_sequences(console, task, DrivesRequest(**given)):
+        console.say(f"wrote {path}")
+    return 0
+
+
+@train.command("mapnet")
+@_drives_options("Sequences")
+def train_mapnet(**given: Any) -> int:
+    """Train MapNet on the drives of DATASET and export it as ONNX.
+
+    DATASET is a folder of `semslam simulate`; keyframes come from a run over its logs, of which `ingest` is enough. The
+    training's folder holds thumbnails and a checkpoint: killed, the same command goes on where it was. Its card
+    says what the network is worth on the logs that test. Needs `pip install 'semslam[train]'`.
+
+    \b
+    Example:
+      semslam ingest homes/logs --out out
+      semslam train mapnet homes --run out --out runs/mapnet
+    """
+    return _train_on_pictures("mapnet", given)
+
+
+@train.command("deepvo")
+@_drives_options("Sequences")
+def train_deepvo(**given: Any) -> int:
+    """Train DeepVO on the drives of DATASET and export it as ONNX.
+
+    DATASET is a folder of `semslam simulate`; keyframes come from a run over its logs, of which `ingest` is enough. The
+    training's folder holds thumbnails and a checkpoint: killed, the same command goes on where it was. Its card
+    says what the network is worth on the logs that test. Needs `pip install 'semslam[train]'`.
+
+    \b
+    Example:
+      semslam ingest homes/logs --out out
+      semslam train deepvo homes --run out --out runs/deepvo
+    """
+    return _train_on_pictures("deepvo", given)
 
 
 @cli.group()
@@ -807,7 +862,7 @@ def models_inspect(file: Path, as_json: bool) -> None:
 
 
 @models.command("export")
-@click.argument("task", type=click.Choice(("detector", "segmenter")))
+@click.argument("task", type=click.Choice(("detector", "segmenter", "mapper", "mapnet", "deepvo")))
 @click.argument("out", type=click.Path(path_type=Path))
 @click.option("--run", "run_folder", type=click.Path(path_type=Path), help="Folder of a training, finished or not.")
 @click.option("--random", "random_seed", type=_SEED, metavar="SEED", help="Randomly initialised instead, from a seed.")
@@ -820,18 +875,18 @@ def models_export(task: str, out: Path, run_folder: Path | None, random_seed: in
     \b
     Example:
       semslam models export detector exported --run runs/detector
-      semslam models export segmenter exported --random 1
+      semslam models export mapnet exported --random 1
     """
     from semslam.models.extras import require_torch
 
     if (run_folder is None) == (random_seed is None):
         raise UsageError("Export what a training learned, or random weights", hint="give `--run` or `--random`")
-    if classes is not None and (run_folder is not None or task != "detector"):
-        raise UsageError("`--classes` names the classes of a random detector alone", hint="leave it out")
+    if classes is not None and (run_folder is not None or task not in ("detector", "mapper")):
+        raise UsageError("`--classes` names the classes of a random detector or mapper alone", hint="leave it out")
     require_torch()
-    from semslam.models.training.runs import TASKS
+    from semslam.models.training.runs import EXPORTS
 
-    for path in TASKS[task].export(out, run_folder, random_seed, classes):
+    for path in EXPORTS[task](out, run_folder, random_seed, classes):
         _complain(f"wrote {path}")
     return 0
 

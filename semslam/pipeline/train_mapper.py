@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from semslam.models.training.drives import DriveSet, RunTables, logs_of
@@ -12,41 +12,26 @@ from semslam.models.training.runs import Run, train_map_update
 from semslam.models.training.trainer import Schedule
 from semslam.pipeline.console import Console
 from semslam.pipeline.run_tables import run_tables
+from semslam.pipeline.train_request import DrivesRequest
 from semslam.pipeline.train_view import LogsView, TrainingView
 from semslam.stages.settings import PaperConfig
 from semslam.tables.spec import MOTION, OBSERVATIONS
 
 
-@dataclass(frozen=True)
-class MapperRequest:
+@dataclass(frozen=True, kw_only=True)
+class MapperRequest(DrivesRequest):
     """What the command asks for; None means the value of the shipped model."""
 
-    dataset: Path
-    out: Path
-    run_folder: Path | None = None
     quality: str = "real"
-    protocol: str = "cross"
     kernel: str = "3"
     side: int = 11
     binary: bool = False
     own: float = 0.5
-    steps: int | None = None
-    batch: int | None = None
-    rate: float | None = None
-    seed: int = 1
-    threads: int = 1
-    device: str = "auto"
 
     @property
     def schedule(self) -> Schedule:
         """How long and how fast."""
-        usual = replace(USUAL, seed=self.seed)
-        return replace(
-            usual,
-            steps=self.steps or usual.steps,
-            batch=self.batch or usual.batch,
-            peak_rate=self.rate or usual.peak_rate,
-        )
+        return self.schedule_from(USUAL)
 
     @property
     def options(self) -> MapperOptions:
@@ -56,14 +41,8 @@ class MapperRequest:
     @property
     def command(self) -> str:
         """What to type to make it again, without folders of this machine."""
-        schedule = self.schedule
-        run = f" --run {self.run_folder.name}" if self.run_folder else ""
-        return (
-            f"semslam train mapper {self.dataset.name}{run} --out {self.out.name} --quality {self.quality} "
-            f"--protocol {self.protocol} --kernel {self.kernel} --side {self.side}{' --binary' * self.binary} "
-            f"--own {self.own:g} --steps {schedule.steps} --batch {schedule.batch} --rate {schedule.peak_rate:g} "
-            f"--seed {schedule.seed} --threads {self.threads}"
-        )
+        sizes = f"--kernel {self.kernel} --side {self.side}{' --binary' * self.binary} --own {self.own:g}"
+        return self.typed("mapper", self.schedule, f"--quality {self.quality} --protocol {self.protocol} {sizes}")
 
 
 def train_on_drives(console: Console, request: MapperRequest) -> list[Path]:

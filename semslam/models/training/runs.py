@@ -1,6 +1,7 @@
 """From pictures to a model that is ready for use: train, export, judge, and write the card.
 
 A run's folder holds `checkpoint.pt` and `curves.csv` while it lasts, and at its end the ONNX file and its card.
+Networks that learn from pictures in a row keep their thumbnails there too, in `pictures/`.
 """
 
 from __future__ import annotations
@@ -10,25 +11,32 @@ import fcntl
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import torch
 from torch import nn
 
 from semslam.errors import SemslamError
+from semslam.labels import class_list
 from semslam.models.class_names import names_from_file
+from semslam.models.nets.deepvo import DeepVoShape
 from semslam.models.nets.detector import INPUT_HEIGHT, INPUT_WIDTH, Detector, DetectorShape, Exported
+from semslam.models.nets.mapnet import MapNetShape
 from semslam.models.nets.segmenter import Segmenter
 from semslam.models.onnxfile import file_digest
+from semslam.models.small_view import HEIGHT, WIDTH
+from semslam.models.training import deepvo, mapnet
 from semslam.models.training.detector import Batches, detection_loss
 from semslam.models.training.drives import DriveSet
 from semslam.models.training.export import export_onnx
 from semslam.models.training.judge import box_table, judged_detector, judged_segmenter, mask_table
 from semslam.models.training.mapping import (
+    MAP_UPDATE,
     MapperOptions,
+    export_map_update,
     judged,
     new_map_update,
     options_for,
@@ -37,9 +45,13 @@ from semslam.models.training.mapping import (
 )
 from semslam.models.training.pictures import CLASSES, PictureSet
 from semslam.models.training.segmenter import PromptBatches, export_segmenter, mask_loss, new_segmenter
+from semslam.models.training.sequences import DriveFiles, PictureDrives
 from semslam.models.training.trainer import CHECKPOINT, Progress, Schedule, fit, read_checkpoint
+from semslam.stages.settings import PaperConfig
 
 DETECTOR = "detector.onnx"
+PICTURES = "pictures"
+"""Folder of a run with the thumbnails that it learns from."""
 
 
 @dataclass(frozen=True)
@@ -216,13 +228,19 @@ _ON_HOMES = (
 
 def _made(run: Run, device: torch.device, network: nn.Module, pictures: PictureSet) -> dict[str, Any]:
     """How a model came about, for its card."""
-    schedule = run.schedule
     return {
         "parameters": f"{parameters_of(network):,}",
         "data": f"{len(pictures):,} views, `{pictures.origin}`, digest {pictures.digest}",
+        **_asked_for(run, device, "views"),
+    }
+
+
+def _asked_for(run: Run, device: torch.device, unit: str) -> dict[str, Any]:
+    """How to make a model again, for its card; `unit` is what a batch counts."""
+    return {
         "command": f"`{run.command} --device {device.type}`",
-        "seed": schedule.seed,
-        "steps": f"{schedule.steps:,} of {schedule.batch} views",
+        "seed": run.schedule.seed,
+        "steps": f"{run.schedule.steps:,} of {run.schedule.batch} {unit}",
         "licence": "Apache-2.0, model and data",
     }
 
@@ -291,7 +309,7 @@ _ON_DRIVES = (
 
 def _mapped(run: Run, device: torch.device, drives: DriveSet, options: MapperOptions) -> dict[str, Any]:
     """What a map update is and how it came about, for its card."""
-    schedule, paper, classes = run.schedule, options.paper, len(drives.classes)
+    paper, classes = options.paper, len(drives.classes)
     around = "r, c" if options.kernel == 1 else "r + 2, c + 2"
     return {
         "input": f"`placed` (1, {classes}, r, c), `hidden` (1, {classes}, {around}), `cell` (1, {classes}, r, c)",
@@ -302,10 +320,7 @@ def _mapped(run: Run, device: torch.device, drives: DriveSet, options: MapperOpt
         "parameters": f"{parameters_of(new_map_update(classes, options.kernel, 0)):,}",
         "data": f"{len(drives)} drives of `{drives.origin}`, quality {drives.quality}, digest {drives.digest}",
         "poses": _posed(options),
-        "command": f"`{run.command} --device {device.type}`",
-        "seed": schedule.seed,
-        "steps": f"{schedule.steps:,} of {schedule.batch} drives",
-        "licence": "Apache-2.0, model and data",
+        **_asked_for(run, device, "drives"),
     }
 
 
@@ -325,6 +340,126 @@ def _mapped_worth(unseen: DriveSet | None, table: str) -> list[str]:
         "inside a region of interest by then, against the class map visible by then:"
     )
     return [text, table]
+
+
+def exported_mapper(out: Path, run: Path | None, seed: int | None, classes: Path | None) -> list[Path]:
+    """Export the map update that a run has learned so far, or random weights, into a folder.
+
+    Raises:
+        SemslamError: no such run, or a damaged file of class names.
+    """
+    stored: dict[str, Any] = {"classes": _class_list(classes), "options": {}}
+    if run is not None:
+        stored = _stored(run, "mapper")["run"]
+    names, options = tuple(stored["classes"]), _mapper_options(stored["options"])
+    network = new_map_update(len(names), options.kernel, seed or 0)
+    if run is not None:
+        network.load_state_dict(_averaged(run, "mapper", network))
+    export_map_update(network, out / MAP_UPDATE, DriveSet((), names, "unknown", options.paper), options)
+    return [out / MAP_UPDATE]
+
+
+def _class_list(classes: Path | None) -> tuple[str, ...]:
+    return class_list(tuple(names_from_file(classes)) if classes else CLASSES)
+
+
+def _mapper_options(stored: Mapping[str, Any]) -> MapperOptions:
+    return replace(_known(MapperOptions, stored), paper=_known(PaperConfig, stored.get("paper", {})))
+
+
+_Facts = TypeVar("_Facts")
+
+
+def _known(kind: type[_Facts], stored: Mapping[str, Any]) -> _Facts:
+    """A dataclass from what a checkpoint tells; fields that it does not tell have their defaults."""
+    names = {one.name for one in fields(kind)}  # type: ignore[arg-type]  # mypy has no bound for dataclasses
+    return kind(**{name: value for name, value in stored.items() if name in names})
+
+
+@dataclass(frozen=True)
+class SequenceTask:
+    """A network that learns motion from pictures in a row."""
+
+    title: str
+    text: str
+    """Of its card."""
+    defaults: Schedule
+    length: int
+    """Keyframes of a training sequence."""
+    train: Callable[..., Path]
+    """As `train_mapnet`."""
+    new: Callable[[], nn.Module]
+    """A network of the usual sizes."""
+    facts: Mapping[str, Any]
+    """What goes in and comes out, for the card."""
+
+
+def train_on_pictures(
+    task: str,
+    run: Run,
+    files: Sequence[DriveFiles],
+    judge: Callable[[Path], Sequence[str]],
+    opened: Callable[[int, int], None] | None = None,
+) -> list[Path]:
+    """Train one of `SEQUENCES`, export it and write its card. A run that was killed goes on where it was.
+
+    Args:
+        task: which.
+        run: what is asked; `data` names the data set on the card, `test` is not looked at.
+        files: what to learn from.
+        judge: tells what an exported file is worth, in paragraphs of Markdown.
+        opened: hears how many of how many logs are in memory.
+
+    Raises:
+        SemslamError: a folder with another run, no such device, or a log that will not do.
+    """
+    device, kind = prepare(run), SEQUENCES[task]
+    with _alone(run.out):
+        drives = PictureDrives.open(files, run.out / PICTURES, opened)
+        path = kind.train(
+            drives, run.out, schedule=run.schedule, length=kind.length, device=device.type, watch=run.watch
+        )
+        write_card(path, kind.title, kind.text, _from_sequences(kind, run, device, drives), judge(path))
+    return [path, path.with_suffix(".md")]
+
+
+def _from_sequences(kind: SequenceTask, run: Run, device: torch.device, drives: PictureDrives) -> dict[str, Any]:
+    """What a network is and how it came about, for its card."""
+    keyframes = sum(len(drive.poses) for drive in drives.drives)
+    return {
+        **kind.facts,
+        "parameters": f"{parameters_of(kind.new()):,}",
+        "data": f"{len(drives)} drives of `{run.data.resolve().name}`, {keyframes:,} keyframes, digest {drives.digest}",
+        **_asked_for(run, device, f"sequences of {kind.length} keyframes"),
+    }
+
+
+def exported_mapnet(out: Path, run: Path | None, seed: int | None, _classes: Path | None) -> list[Path]:
+    """Export the MapNet that a run has learned so far, or random weights, into a folder.
+
+    Raises:
+        SemslamError: no such run.
+    """
+    shape = _known(MapNetShape, _stored(run, "mapnet")["run"] if run else {})
+    network = mapnet.new_mapnet(shape, seed or 0)
+    if run is not None:
+        network.load_state_dict(_averaged(run, "mapnet", network))
+    whole = replace(shape, map_side=MapNetShape().map_side)  # training has a small map
+    mapnet.export_mapnet(network, out / mapnet.MAPNET, whole)
+    return [out / mapnet.MAPNET]
+
+
+def exported_deepvo(out: Path, run: Path | None, seed: int | None, _classes: Path | None) -> list[Path]:
+    """Export the DeepVO that a run has learned so far, or random weights, into a folder.
+
+    Raises:
+        SemslamError: no such run.
+    """
+    network = deepvo.new_deepvo(_known(DeepVoShape, _stored(run, "deepvo")["run"] if run else {}), seed or 0)
+    if run is not None:
+        network.load_state_dict(_averaged(run, "deepvo", network))
+    deepvo.export_deepvo(network, out / deepvo.DEEPVO)
+    return [out / deepvo.DEEPVO]
 
 
 def exported_detector(out: Path, run: Path | None, seed: int | None, classes: Path | None) -> list[Path]:
@@ -436,4 +571,48 @@ TASKS: Mapping[str, Task] = {
     "detector": Task(Schedule(steps=14000, batch=16), train_detector, exported_detector),
     "segmenter": Task(Schedule(steps=9000, batch=4), train_segmenter, exported_segmenter),
 }
-"""What `semslam train` can train."""
+"""What `semslam train` can train on views."""
+
+
+_ON_PICTURES = (
+    "Trained on drives through simulated homes alone, with mirrored pictures and changed light. Expect little of it "
+    "elsewhere."
+)
+SEQUENCES: Mapping[str, SequenceTask] = {
+    "mapnet": SequenceTask(
+        "MapNet (Henriques and Vedaldi, 2018)",
+        f"A map of image features in which the robot finds itself. {_ON_PICTURES} `localize.mapnet.model` takes it.",
+        mapnet.USUAL,
+        mapnet.LENGTH,
+        mapnet.train_mapnet,
+        lambda: mapnet.new_mapnet(MapNetShape(), 0),
+        {
+            "input": f"`picture` (1, 3, {HEIGHT}, {WIDTH}) RGB 0 to 1, `cells` of its parts by depth, `given`, the map",
+            "output": "`field` (headings, rows, columns) over poses, the new map",
+            "grid": (
+                f"{MapNetShape().map_side} x {MapNetShape().map_side} cells of {MapNetShape().cell_m:g} m, "
+                f"{MapNetShape().headings} headings, observations of {MapNetShape().side} x {MapNetShape().side} cells"
+            ),
+        },
+    ),
+    "deepvo": SequenceTask(
+        "DeepVO (Wang et al., 2017)",
+        f"The motion between two pictures, with a memory. {_ON_PICTURES} `localize.deepvo.model` takes it.",
+        deepvo.USUAL,
+        deepvo.LENGTH,
+        deepvo.train_deepvo,
+        lambda: deepvo.new_deepvo(DeepVoShape(), 0),
+        {
+            "input": f"`pair` (1, 6, {HEIGHT}, {WIDTH}) former and latter picture, RGB 0 to 1, and the memory",
+            "output": "`motion` (1, 3) dx, dy in metres and dheading in radians, in the former robot frame; the memory",
+        },
+    ),
+}
+"""What learns from pictures in a row: `semslam train mapnet` and `semslam train deepvo`."""
+EXPORTS: Mapping[str, Callable[[Path, Path | None, int | None, Path | None], list[Path]]] = {
+    **{name: task.export for name, task in TASKS.items()},
+    "mapper": exported_mapper,
+    "mapnet": exported_mapnet,
+    "deepvo": exported_deepvo,
+}
+"""What `semslam models export` can export; arguments as those of `Task.export`."""
