@@ -3,10 +3,9 @@
     python benchmarks/extract_share.py [LOG] [--detector FILE.onnx] [--classes FILE.txt] [--segmenter NAME]
         [--encoder FILE.onnx --decoder FILE.onnx] [--batch 1] [--rounds 5] [--quick]
 
-Without options, the demo's log and the shipped models; where there are none, the demo's detector and no network for
-masks. Extract runs whole, from the tables it reads to those it writes, in this process and with one thread for every
-library. The baseline is ONNX Runtime alone, with the same tensors, in the same process; both take turns, and the best
-round of each counts. Opening the models, once a log, is left out of both.
+Without options, the demo's log and the shipped models. Extract runs whole, from the tables it reads to those it writes,
+in this process and with one thread for every library. The baseline is ONNX Runtime alone, with the same tensors, in the
+same process; both take turns, and the best round of each counts. Opening the models, once a log, is left out of both.
 
 Extract decodes the next keyframe and projects the last one in threads while the models look at this one: the share of
 wall time shows it where processors are free for them, the share of CPU time never does.
@@ -28,10 +27,10 @@ from unittest import mock
 
 from machine import machine
 
-from semslam.models.builtin import shipped, with_shipped
+from semslam.models.builtin import with_shipped
 from semslam.models.session import Session
 from semslam.pipeline.cache import table_files
-from semslam.pipeline.demo import demo_log, demo_settings
+from semslam.pipeline.demo import demo_log
 from semslam.pipeline.job import InputFile, Job
 from semslam.pipeline.threads import ONE_THREAD
 from semslam.pipeline.worker import execute
@@ -164,10 +163,9 @@ def main() -> None:
     args = parser.parse_args()
     if any(os.environ.get(name) != value for name, value in ONE_THREAD.items()):  # libraries read it when they load
         os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **ONE_THREAD})
-    ours = "" if shipped("detector") else str(demo_settings()["extract.detector"])
     config = with_shipped(
         ExtractConfig(
-            detector=args.detector or ours,
+            detector=args.detector,
             classes=args.classes,
             segmenter=args.segmenter,
             segmenter_encoder=args.encoder,

@@ -422,23 +422,24 @@ def _extract_eyes(ours: Finder, segmenter: Segmenter, min_score: float) -> extra
 
 def _keyframe(picture: Picture, pose: Matrix, config: ExtractConfig) -> extract.Frame:
     """A picture as extract has it; `pose` is robot_from_camera."""
-    good = (picture.depth_m >= config.min_depth_m) & (picture.depth_m <= config.max_depth_m)
-    depth_m = np.where(good, picture.depth_m, np.float32(0.0)).astype(np.float32)
+    depth_m = np.asarray(picture.depth_m, np.float32)
+    in_range = (depth_m > 0) & (depth_m >= config.min_depth_m) & (depth_m <= config.max_depth_m)
     camera = LogOptions().camera
     landing = land(
-        points_in_robot(depth_m, camera.fx, camera.fy, camera.cx, camera.cy, pose),
-        depth_m > 0,
+        points_in_robot(depth_m * in_range, camera.fx, camera.fy, camera.cx, camera.cy, pose),
+        in_range,
         cell_m=config.cell_m,
         side=config.side,
         floor_tolerance_m=config.floor_tolerance_m,
         max_height_m=config.max_height_m,
     )
-    return extract.Frame({"frame": 0, "stamp_nanos": 0}, picture.rgb, depth_m, landing)
+    return extract.Frame({"frame": 0, "stamp_nanos": 0}, picture.rgb, depth_m, in_range, landing)
 
 
 def _real(keyframe: extract.Frame, eyes: extract.Eyes) -> Planes:
     """Through extract itself; planes in the order of our classes."""
-    (found,) = extract.find([keyframe], eyes)
+    (detections,) = extract.find([keyframe], eyes)
+    found = extract.cut_out(keyframe, detections, eyes)
     if isinstance(found, SemslamError):
         raise found
     seen, names = extract.look(keyframe, found, eyes).observation, eyes.classes.all

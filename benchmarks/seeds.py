@@ -16,7 +16,6 @@ from pathlib import Path
 
 from machine import machine
 
-from semslam.pipeline.demo import demo_settings
 from semslam.sim.dataset import Recipe
 from semslam.sim.simulate import simulate
 
@@ -34,17 +33,7 @@ def main() -> None:
         folder = Path(temporary)
         simulate(folder / "homes", recipe)
         command = [sys.executable, "-m", "semslam.pipeline.cli"]
-        detector = str(demo_settings()["extract.detector"])
-        run = [
-            *command,
-            "run",
-            str(folder / "homes" / "logs"),
-            "--out",
-            str(folder / "out"),
-            "--detector",
-            detector,
-            "--quiet",
-        ]
+        run = [*command, "run", str(folder / "homes" / "logs"), "--out", str(folder / "out"), "--quiet"]
         subprocess.run(run, check=True)
         done = subprocess.run([*command, "evaluate", str(folder / "out")], check=True, capture_output=True, text=True)
         print(done.stdout)

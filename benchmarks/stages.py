@@ -1,12 +1,11 @@
-"""What ingest and extract cost beside the bare libraries under them, and how much memory ingest takes.
+"""What ingest costs beside the bare libraries under it, and how much memory it takes. Extract has `extract_share.py`.
 
-    python benchmarks/stages.py [LOG --detector FILE.onnx --classes FILE.txt] [--quick]
+    python benchmarks/stages.py [LOG] [--quick]
 
-Without a log, the demo's log and detector. Every figure is CPU time of a process of its own, imports included, and a
-ratio to a baseline process on the same input in the same run:
+Without a log, the demo's. Every figure is CPU time of a process of its own, imports included, and a ratio to a
+baseline process on the same input in the same run:
 
 - ingest (all pairs, a keyframe a second) against `mcap` with its ROS 2 decoder and `cv2.imdecode` of every image;
-- extract against ONNX Runtime alone, on the same frames and input tensors, once with each segmenter;
 - peak memory of ingest on logs of 100 MB and 1 GB, beside that of importing the same libraries.
 """
 
@@ -26,7 +25,7 @@ from machine import machine
 
 from semslam.logs.messages import CameraInfo, Image, Imu
 from semslam.logs.writer import Ros2LogWriter
-from semslam.pipeline.demo import demo_log, demo_settings
+from semslam.pipeline.demo import demo_log
 from semslam.pipeline.threads import ONE_THREAD
 
 _DECODE = """
@@ -40,22 +39,6 @@ with open(sys.argv[1], "rb") as file:
             start = 12 if "compressedDepth" in message.format else 0
             pixels += cv2.imdecode(np.frombuffer(message.data, np.uint8)[start:], cv2.IMREAD_UNCHANGED).size
 print(pixels)
-"""
-
-_INFER = """
-import sys
-from pathlib import Path
-import numpy as np
-from semslam.models.detectors import Detector
-from semslam.tables.parquet import TableFiles
-from semslam.tables.pictures import decode_colour
-from semslam.tables.spec import FRAMES
-detector = Detector.open(Path(sys.argv[1]), classes_path=Path(sys.argv[2]) if sys.argv[2] else None)
-frames = TableFiles(FRAMES, sorted(Path(sys.argv[3]).glob("cache/ingest/*/shard-*/frames.parquet")))
-first = decode_colour(next(frames.batches(["colour"], 0, 1))["colour"][0])
-feeds, _ = detector.adapter.preprocess(first, None, detector.signature)
-for _ in range(frames.rows if sys.argv[4] == "run" else 0):
-    detector.session.run(feeds)
 """
 
 _IMPORT = "import numpy, cv2, pyarrow.parquet, semslam.stages.ingest"
@@ -109,20 +92,6 @@ def ingest(log: Path, folder: Path) -> None:
     ratio("ingest, every pair", measure(every), baseline, what)
 
 
-def extract(log: Path, folder: Path, options: Sequence[str], detector: str, classes: str) -> None:
-    """Extract against bare inference; what both spend on starting is taken off."""
-    out = str(folder / "a")
-    idle = measure(python(_INFER, detector, classes, out, "open"))
-    run = measure(python(_INFER, detector, classes, out, "run"))
-    baseline = Cost(run.cpu_s - idle.cpu_s, 0.0, 0.0)
-    nothing = measure(semslam("ingest", str(log), "--out", out))  # all cached: what a command costs by itself
-    for segmenter in ("box", "depth_box"):
-        words = ["extract", str(log), "--out", out, *options, "--set", f"extract.segmenter={segmenter}"]
-        whole = measure(semslam(*words))
-        start = nothing.cpu_s + idle.cpu_s
-        ratio(f"extract, segmenter {segmenter}", Cost(whole.cpu_s - start, 0.0, 0.0), baseline, "ONNX Runtime alone")
-
-
 def big_log(path: Path, megabytes: int) -> None:
     """A log of raw pictures that do not compress, 30 pairs a second, with an IMU."""
     rng = np.random.default_rng(0)
@@ -159,18 +128,12 @@ def main() -> None:
     """Parse and run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("log", nargs="?", type=Path)
-    parser.add_argument("--detector", default="")
-    parser.add_argument("--classes", default="")
     parser.add_argument("--quick", action="store_true", help="small inputs: only to see that it runs")
     args = parser.parse_args()
-    print(machine("mcap", "mcap-ros2-support", "onnxruntime", "opencv-contrib-python-headless", "numpy"))
+    print(machine("mcap", "mcap-ros2-support", "opencv-contrib-python-headless", "numpy"))
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        log = args.log or demo_log()
-        detector = args.detector or str(demo_settings()["extract.detector"])
-        options = ["--detector", detector, *(["--classes", args.classes] if args.classes else [])]
-        ingest(log, folder)
-        extract(log, folder, options, detector, args.classes)
+        ingest(args.log or demo_log(), folder)
         memory(folder, [20] if args.quick else [100, 1000])
 
 

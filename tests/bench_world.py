@@ -24,7 +24,7 @@ from tests.make_log import ToyTruth, make_log
 CLASSES = class_list(
     ("chair", "table", "sofa", "bed", "bookshelf", "dresser", "plant", "lamp", "tv", "bin", "refrigerator", "toilet")
 )
-"""Those of the demo's detector."""
+"""Those of the shipped detector."""
 _SAME = {"shelf": "bookshelf"}
 _FINE_M, _FINE_SIDE, _CELL_M, _SIDE = 0.1, 99, 0.3, 33
 _SEEN_M, _HALF_VIEW_RAD = 4.0, math.radians(35)

@@ -15,7 +15,6 @@ from evo.tools import file_interface
 
 from semslam.bench.tracks import Pipeline, stored_track, true_track
 from semslam.metrics import score
-from semslam.pipeline.demo import demo_settings
 from semslam.slam.exchange import tum
 from semslam.stages.catalogue import STAGES
 from semslam.tables.spec import POSES
@@ -32,7 +31,7 @@ def test_errors_of_an_exported_track_are_evos(tmp_path: Path) -> None:
     """Mean and worst position and heading error, both tracks seen from their first pose, to a micrometre."""
     homes = make_dataset(tmp_path / "homes", scenes=1, trajectories=1, frames=FRAMES)
     settings = {"localize.estimators": ["dead_reckoning"]}
-    with Pipeline.opened(tmp_path / "out", STAGES, homes, options=demo_settings(), workers=0) as pipeline:
+    with Pipeline.opened(tmp_path / "out", STAGES, homes, workers=0) as pipeline:
         runs = pipeline.run("export", ["toy_00_t0"], settings)
     assert not runs.failures
     truth = true_track(homes, "toy_00_t0", FRAMES)

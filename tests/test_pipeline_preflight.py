@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from semslam.errors import UsageError
+from semslam.models import builtin
 from semslam.pipeline.cache import EntryIndex
 from semslam.pipeline.cli import run_command
 from semslam.pipeline.config import load_config
@@ -44,13 +45,11 @@ GOOD = ["--detector", "detector.onnx", "--classes", "classes.txt"]
 @pytest.mark.parametrize(
     ("arguments", "message", "hint"),
     [
-        ([], "No detector", "--detector FILE.onnx"),
         (["--detector", "broken.onnx"], "is no ONNX file, or is damaged", "again"),
         (["--detector", "encoder.onnx"], "No adapter fits detector", "extract.adapter"),
         (["--detector", "detector.onnx", "--classes", "three.txt"], "3", ""),
         ([*GOOD, "--set", "extract.adapter=yolo99"], "No detector adapter `yolo99`", "yolov8"),
         ([*GOOD, "--set", "extract.select=chiar"], "names the class `chiar`", "did you mean `chair`?"),
-        ([*GOOD, "--set", "extract.segmenter=sam"], "no models are given", "--segmenter-encoder"),
         ([*GOOD, "--segmenter-encoder", "encoder.onnx"], "an image encoder and a mask decoder", "--segmenter-decoder"),
         ([*GOOD, "--set", "extract.side=98"], "`extract.side` is 98", "extract.side=99"),
         ([*GOOD, "--set", "localize.paper.map_side=32"], "`localize.paper.map_side` is 32", "33"),
@@ -81,14 +80,40 @@ def test_a_wrong_configuration_is_wrong_use(
     assert not (tmp_path / "config.json").exists()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message", "hint"),
+    [
+        ([], "No detector", "--detector FILE.onnx"),
+        ([*GOOD, "--set", "extract.segmenter=sam"], "no models are given", "--segmenter-encoder"),
+    ],
+)
+def test_a_package_without_models_asks_for_some(
+    files: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: Capture,
+    arguments: list[str],
+    message: str,
+    hint: str,
+) -> None:
+    """Whoever packs semslam without its weights gets told what to name."""
+    monkeypatch.chdir(files)
+    monkeypatch.setattr(builtin, "FOLDER", tmp_path / "nothing")
+    assert run_command(["run", "logs", "--out", str(tmp_path), "--workers", "0", *arguments], None) == 2
+    shown = capsys.readouterr().err
+    assert message in shown
+    assert hint in shown
+
+
 def test_a_right_configuration_gets_to_the_logs(
     files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     """Which are no logs here, and are told so each; a stage that is not asked for is not checked."""
     monkeypatch.chdir(files)
     sam = ["--segmenter-encoder", "encoder.onnx", "--segmenter-decoder", "decoder.onnx"]
-    assert run_command(["run", "logs", "--out", str(tmp_path), "--workers", "0", *GOOD, *sam], None) == 1
-    assert capsys.readouterr().err.count("error: ingest of") == 3
+    for models in ([], GOOD, [*GOOD, *sam]):
+        assert run_command(["run", "logs", "--out", str(tmp_path), "--workers", "0", *models], None) == 1
+        assert capsys.readouterr().err.count("error: ingest of") == 3
     assert run_command(["ingest", "logs", "--out", str(tmp_path), "--workers", "0"], None) == 1
     assert capsys.readouterr().err.count("error: ingest of") == 3
 

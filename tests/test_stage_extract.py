@@ -371,17 +371,18 @@ def test_masks_of_another_size_are_no_traceback(
 def test_shipped_models_are_used_where_none_are_named(
     drive: tuple[Done, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without a setting extract takes the models of the package; with one, that."""
+    """Without a setting extract takes the models of the package; with one, that. The pair goes with the detector."""
     frames, detector = drive
     monkeypatch.setattr(builtin, "FOLDER", tmp_path)
     moving_detector(tmp_path / "detector.onnx")
     assert extract(tmp_path / "a", frames, "").digests == extract(tmp_path / "b", frames, detector).digests
     pair = sam_encoder(tmp_path / "segmenter_encoder.onnx"), sam_decoder(tmp_path / "segmenter_decoder.onnx")
-    shipped = extract(tmp_path / "c", frames, detector)
+    shipped = extract(tmp_path / "c", frames, "")
     given = {"segmenter_encoder": str(pair[0]), "segmenter_decoder": str(pair[1])}
     assert shipped.digests == extract(tmp_path / "d", frames, detector, segmenter="sam", **given).digests
-    plain = extract(tmp_path / "e", frames, detector, segmenter="depth_box")
-    assert shipped.digests != plain.digests
+    assert shipped.digests == extract(tmp_path / "e", frames, detector, segmenter="sam").digests
+    plain = extract(tmp_path / "f", frames, detector, segmenter="depth_box")
+    assert shipped.digests != plain.digests == extract(tmp_path / "g", frames, detector).digests
 
 
 def test_the_cache_key_holds_the_shipped_models_that_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -399,7 +400,9 @@ def test_the_cache_key_holds_the_shipped_models_that_are_used(tmp_path: Path, mo
     every = {key: f"{key.removeprefix('extract.')}.onnx" for key in keys}
     assert named() == named("extract.segmenter=sam") == every
     assert named("extract.segmenter=box") == {"extract.detector": "detector.onnx"}
-    assert named("extract.detector=mine.onnx") == every | {"extract.detector": "mine.onnx"}
+    assert named("extract.detector=mine.onnx") == {"extract.detector": "mine.onnx"}
+    mine = every | {"extract.detector": "mine.onnx"}
+    assert named("extract.detector=mine.onnx", "extract.segmenter=sam") == mine
     half = named("extract.segmenter_encoder=mine.onnx")
     assert half == {"extract.detector": "detector.onnx", "extract.segmenter_encoder": "mine.onnx"}
     assert with_shipped(with_shipped(ExtractConfig())) == with_shipped(ExtractConfig())

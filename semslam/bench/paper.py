@@ -31,9 +31,7 @@ from semslam.bench.store import Store
 from semslam.bench.tracks import Pipeline, Runs
 from semslam.bench.work import BenchRequest, Work
 from semslam.errors import SemslamError
-from semslam.models.builtin import shipped
 from semslam.pipeline.console import Console
-from semslam.pipeline.demo import demo_settings
 from semslam.pipeline.files import write_text
 from semslam.stages.contract import Stage
 
@@ -74,7 +72,6 @@ def bench_paper(request: BenchRequest, stages: Sequence[Stage], console: Console
     base = {"config_file": request.config_file, "assignments": request.assignments, "workers": request.workers}
     folder = request.run or request.out / "pipeline"
     with Pipeline.opened(folder, stages, dataset.root, options=request.options, **base) as pipeline:
-        pipeline = _with_detector(pipeline)
         seen = _observed(pipeline, dataset, console)
         work = Work(request, dataset, pipeline, Store(request.out / "parts"), console, rows, seen)
         results = _measured(work)
@@ -90,13 +87,6 @@ def _quick(request: BenchRequest) -> BenchRequest:
 def _require_report() -> None:
     if not figures.available():
         raise SemslamError("Figures need matplotlib, which is not installed", hint="pip install 'semslam[report]'")
-
-
-def _with_detector(pipeline: Pipeline) -> Pipeline:
-    """The shipped detector, or the demo's, which knows simulated homes, unless the configuration names one."""
-    if pipeline.config().sections["extract"].detector or shipped("detector"):
-        return pipeline
-    return replace(pipeline, options={**(pipeline.options or {}), **demo_settings()})
 
 
 def _observed(pipeline: Pipeline, dataset: Dataset, console: Console) -> Runs:

@@ -52,11 +52,15 @@ def with_shipped(config: Any) -> Any:
 
 
 def _extract_with_shipped(config: ExtractConfig) -> ExtractConfig:
-    detector = config.detector or str(shipped("detector") or "")
-    encoder, decoder = config.segmenter_encoder, config.segmenter_decoder
-    ours = shipped("segmenter_encoder"), shipped("segmenter_decoder")
-    if config.segmenter in ("auto", "sam") and not (encoder or decoder) and all(ours):
-        encoder, decoder = str(ours[0]), str(ours[1])
+    """Left to itself, the segmenter goes with the detector of the package alone: it knows the same simulated homes."""
+    ours = str(shipped("detector") or "")
+    detector, encoder, decoder = config.detector or ours, config.segmenter_encoder, config.segmenter_decoder
+    pair = shipped("segmenter_encoder"), shipped("segmenter_decoder")
+    wanted = config.segmenter == "sam" or (
+        config.segmenter == "auto" and Path(detector).resolve() == Path(ours).resolve()
+    )
+    if wanted and not (encoder or decoder) and all(pair):
+        encoder, decoder = str(pair[0]), str(pair[1])
     return replace(config, detector=detector, segmenter_encoder=encoder, segmenter_decoder=decoder)
 
 

@@ -245,12 +245,12 @@ def demo(context: click.Context, out: Path, workers: int | None, as_json: bool, 
     Example:
       semslam demo --out semslam_demo
     """
-    from semslam.pipeline.demo import demo_log, demo_settings
+    from semslam.pipeline.demo import demo_log
     from semslam.pipeline.run import RunRequest, run
 
-    log, settings = demo_log(), demo_settings()
+    log = demo_log()
     console = _console(quiet=quiet)
-    request = RunRequest([str(log)], out, _stages(context)[-1].name, "demo", options=settings, workers=workers)
+    request = RunRequest([str(log)], out, _stages(context)[-1].name, "demo", workers=workers)
     outcome = run(request, _stages(context), console)
     if as_json:
         _print_json(outcome.as_json())
@@ -561,14 +561,14 @@ def train() -> None:
 
     \b
     Example:
-      semslam train pictures views --homes 200 --views 20 --seed 1000
+      semslam train pictures views --homes 120 --views 20 --seed 1000
       semslam train detector views --out runs/detector
     """
 
 
 @train.command("pictures")
 @click.argument("out", type=click.Path(path_type=Path))
-@click.option("--homes", type=int, default=200, show_default=True, help="Simulated homes.")
+@click.option("--homes", type=int, default=120, show_default=True, help="Simulated homes.")
 @click.option("--views", type=int, default=20, show_default=True, help="Pictures of each.")
 @click.option("--seed", type=int, default=1000, show_default=True, help="Homes of `semslam simulate --seed`.")
 @click.option("--unfamiliar", is_flag=True, help="Lights, palettes and cameras that training never uses; for tests.")
@@ -583,7 +583,7 @@ def train_pictures(out: Path, workers: int | None, as_json: bool, quiet: bool, *
 
     \b
     Example:
-      semslam train pictures views --homes 200 --views 20 --seed 1000
+      semslam train pictures views --homes 120 --views 20 --seed 1000
     """
     from semslam.pipeline.train_view import PicturesView, say_pictures
     from semslam.sim.engine import require_engine
@@ -802,7 +802,7 @@ def bench_paper_command(
 
     DATASET is a folder of `semslam simulate`; --quick makes a tiny one if none is named. OUT/results/README.md holds
     it all. Killed, the same command goes on where it was. What cannot be run is listed with the reason. Needs
-    `pip install 'semslam[report]'`, and for its networks `[train]`.
+    `pip install 'semslam[report,sim,train]'`.
 
     \b
     Example:

@@ -1,18 +1,17 @@
-"""What `semslam demo` runs on: half a minute of a small robot in a simulated home, and a detector for such homes.
+"""What `semslam demo` runs on: half a minute of a small robot in a simulated home.
 
-Both are files of the package with a card beside them that says how they were made; the log is read like any other, and
-only the detector knows such homes.
+A file of the package with a card beside it that says how it was made; it is read like any other log, with the models
+and the configuration that every log gets. The home is none that those models were trained on.
 """
 
 from __future__ import annotations
 
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 from semslam.errors import SemslamError
 
-LOG, DETECTOR = "demo_home.mcap", "demo_detector.onnx"
+LOG = "demo_home.mcap"
 
 
 def demo_log() -> Path:
@@ -21,20 +20,7 @@ def demo_log() -> Path:
     Raises:
         SemslamError: the installed package lacks it.
     """
-    return _bundled(LOG)
-
-
-def demo_settings() -> dict[str, Any]:
-    """Configuration that the demo needs beyond the defaults, by key.
-
-    Raises:
-        SemslamError: the installed package lacks the detector.
-    """
-    return {"extract.detector": str(_bundled(DETECTOR))}
-
-
-def _bundled(name: str) -> Path:
-    path = Path(str(files("semslam") / "data" / name))
+    path = Path(str(files("semslam") / "data" / LOG))
     if not path.is_file():
         raise SemslamError(f"A file of the demo is missing: no `{path}`", hint="install again with `pip install .`")
     return path

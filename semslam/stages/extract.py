@@ -223,7 +223,7 @@ def _counted(items: Iterable[T], ctx: StageContext, start: int, total: int) -> I
 def _recognised(groups: Iterator[list[Frame]], eyes: Eyes) -> Iterator[Recognised]:
     """Groups of keyframes through the models."""
     for group in groups:
-        yield [(frame, _masked(frame, found, eyes)) for frame, found in zip(group, find(group, eyes), strict=True)]
+        yield [(frame, cut_out(frame, found, eyes)) for frame, found in zip(group, find(group, eyes), strict=True)]
 
 
 def find(group: Sequence[Frame], eyes: Eyes) -> list[Detections | SemslamError]:
@@ -236,7 +236,7 @@ def find(group: Sequence[Frame], eyes: Eyes) -> list[Detections | SemslamError]:
         return [error] if len(group) == 1 else [one for frame in group for one in find([frame], eyes)]
 
 
-def _masked(frame: Frame, found: Detections | SemslamError, eyes: Eyes) -> Found | SemslamError:
+def cut_out(frame: Frame, found: Detections | SemslamError, eyes: Eyes) -> Found | SemslamError:
     """The detections of classes that are kept, with their pixels."""
     if isinstance(found, SemslamError):
         return found

@@ -6,7 +6,7 @@ Reads   frames         data_spec.md, table 2, if the estimator looks at pictures
 Writes  poses          data_spec.md, table 7
         snapshots      data_spec.md, table 8: the estimator's own map, or the map of cells so far if it keeps none
         cells          data_spec.md, table 9: the map of the whole log, in the last shard
-Paper   equations 2 to 7 and 10
+Paper   equations 2 to 8 and 10
 
 A step needs all steps before it. Each shard therefore keeps the state after its last keyframe (`state.npz`), and a run
 that goes on takes up the state of the last finished shard: the bytes are those of an undisturbed run.

@@ -75,9 +75,9 @@ class ExtractConfig:
     """Text file with the detector's class names, one a line; empty takes them from the model's metadata."""
     segmenter: str = setting("auto", choices=("auto", "sam", "depth_box", "box"))
     """How a box becomes a mask; auto takes the masks of the detector if it gives any, else those of the encoder and
-    decoder below, else depth_box (GrabCut seeded by depth)."""
+    decoder below, else, with the shipped detector, those of the shipped pair; else depth_box: GrabCut with depth."""
     segmenter_encoder: str = setting("", file=True)
-    """ONNX file of the segmenter's image encoder; empty, like the decoder, takes the shipped one."""
+    """ONNX file of the segmenter's image encoder; empty, like the decoder, takes the shipped one where it is wanted."""
     segmenter_decoder: str = setting("", file=True)
     """ONNX file of the segmenter's box-prompted mask decoder."""
     min_score: float = setting(0.3, low=0.0, high=1.0)
@@ -113,7 +113,7 @@ class ExtractConfig:
 
 @dataclass(frozen=True)
 class PaperConfig:
-    """The estimator of the paper, equations 2 to 7 and 10."""
+    """The estimator of the paper, equations 2 to 8 and 10."""
 
     cell_m: float = setting(0.3, low=0.01, high=10.0)
     """Cell of the map, metres; an odd multiple of extract.cell_m."""

@@ -568,8 +568,8 @@ def write_card(path: Path, title: str, text: str, facts: Mapping[str, Any], more
 
 
 TASKS: Mapping[str, Task] = {
-    "detector": Task(Schedule(steps=14000, batch=16), train_detector, exported_detector),
-    "segmenter": Task(Schedule(steps=9000, batch=4), train_segmenter, exported_segmenter),
+    "detector": Task(Schedule(steps=8000, batch=16), train_detector, exported_detector),
+    "segmenter": Task(Schedule(steps=7000, batch=4), train_segmenter, exported_segmenter),
 }
 """What `semslam train` can train on views."""
 
