@@ -56,9 +56,8 @@ def _extract_with_shipped(config: ExtractConfig) -> ExtractConfig:
     ours = str(shipped("detector") or "")
     detector, encoder, decoder = config.detector or ours, config.segmenter_encoder, config.segmenter_decoder
     pair = shipped("segmenter_encoder"), shipped("segmenter_decoder")
-    wanted = config.segmenter == "sam" or (
-        config.segmenter == "auto" and Path(detector).resolve() == Path(ours).resolve()
-    )
+    own = Path(detector).resolve() == Path(ours).resolve()
+    wanted = config.segmenter == "sam" or (config.segmenter == "auto" and own)
     if wanted and not (encoder or decoder) and all(pair):
         encoder, decoder = str(pair[0]), str(pair[1])
     return replace(config, detector=detector, segmenter_encoder=encoder, segmenter_decoder=decoder)

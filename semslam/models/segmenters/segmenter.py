@@ -28,7 +28,7 @@ def open_segmenter(kind: str, encoder: str = "", decoder: str = "", threads: int
     """The segmenter a configuration names.
 
     Args:
-        kind: auto, sam, depth_box or box; auto is sam if its two files are given (`models/builtin.py` may have), else depth_box.
+        kind: auto, sam, depth_box or box; auto is sam if its two files are given (`builtin.py` may), else depth_box.
         encoder: ONNX file of the image encoder, for sam: semslam's own (its metadata says so) or one of SAM's kind.
         decoder: ONNX file of the mask decoder that belongs to it.
         threads: threads within an operator.
