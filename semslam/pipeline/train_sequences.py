@@ -15,9 +15,6 @@ from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from semslam.errors import SemslamError
 from semslam.metrics import Score, Track, chance, score, standstill
@@ -31,10 +28,10 @@ from semslam.pipeline.run_tables import run_tables
 from semslam.pipeline.train_request import DrivesRequest
 from semslam.pipeline.train_view import LogsView, TrainingView
 from semslam.slam.deepvo_estimator import DeepVoEstimator
-from semslam.slam.estimator import Estimator, Step, View
+from semslam.slam.estimator import Estimator, Step
 from semslam.slam.mapnet_estimator import MapNetEstimator
+from semslam.slam.views import view_of
 from semslam.tables.parquet import TableFiles
-from semslam.tables.pictures import decode_colour, decode_depth
 from semslam.tables.spec import FRAMES, MOTION, TRUTH
 
 SCORED = 30
@@ -174,13 +171,4 @@ def _steps(frames: Sequence[Path], steps: int) -> Iterator[Step]:
     batches = TableFiles(FRAMES, frames).batches(_VIEW, batch_rows=8)
     rows = (dict(zip(batch, row, strict=True)) for batch in batches for row in zip(*batch.values(), strict=True))
     for row in islice(rows, steps):
-        yield Step(row["frame"], row["stamp_nanos"], None, None, _view(row))
-
-
-def _view(row: Mapping[str, Any]) -> View:
-    return View(
-        rgb=decode_colour(row["colour"]),
-        depth_m=decode_depth(row["depth"]),
-        **{name: row[name] for name in ("fx", "fy", "cx", "cy")},
-        robot_from_camera=np.array(row["robot_from_camera"], np.float64).reshape(4, 4),
-    )
+        yield Step(row["frame"], row["stamp_nanos"], None, None, view_of(row))

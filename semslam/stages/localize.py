@@ -26,13 +26,13 @@ from semslam.geometry.grid import Planes, to_dense, to_sparse
 from semslam.labels import UNOBSERVED
 from semslam.models.memory import keep_freed_memory
 from semslam.slam.checkpoint import as_array, pack, unpack
-from semslam.slam.estimator import Belief, Estimator, PoseEstimate, Step, View
+from semslam.slam.estimator import Belief, Estimator, PoseEstimate, Step
 from semslam.slam.evidence import Evidence, Snapshot
 from semslam.slam.health import TrackHealth
 from semslam.slam.registry import NEEDS_VIEWS, WITHOUT_MOTION, open_estimator
+from semslam.slam.views import view_of
 from semslam.stages.contract import FinishedShard, ShardWriter, StageContext, TableSource, row_shards
 from semslam.stages.settings import LocalizeConfig
-from semslam.tables.pictures import decode_colour, decode_depth
 from semslam.tables.spec import CELLS, FRAMES, MOTION, OBSERVATIONS, POSES, SNAPSHOTS
 
 _STATE = "state.npz"
@@ -161,7 +161,7 @@ def _steps(
         sight = sights.at(row["frame"])
         picture = pictures.at(row["frame"]) if pictures else None
         observation = None if sight is None else _planes(sight, shape)
-        view = None if picture is None else _view(picture)
+        view = None if picture is None else view_of(picture)
         yield Step(row["frame"], row["stamp_nanos"], observation, _motion(row), view)
 
 
@@ -193,20 +193,6 @@ def _rows(
     for batch in table.batches(columns, start, stop, _ROWS_READ):
         for values in zip(*batch.values(), strict=True):
             yield dict(zip(batch, values, strict=True))
-
-
-def _view(row: Mapping[str, Any]) -> View:
-    """The keyframe's pictures, decoded.
-
-    Raises:
-        SemslamError: one cannot be decoded.
-    """
-    return View(
-        rgb=decode_colour(row["colour"]),
-        depth_m=decode_depth(row["depth"]),
-        **{name: row[name] for name in ("fx", "fy", "cx", "cy")},
-        robot_from_camera=np.array(row["robot_from_camera"], np.float64).reshape(4, 4),
-    )
 
 
 def _motion(row: Mapping[str, Any]) -> SE2 | None:
