@@ -143,14 +143,18 @@ def turn(observations: Tensor, headings: int) -> Tensor:
     (B, C, h, h) -> (B, R, C, h, h). All of a batch turn as channels of one picture.
     """
     batch, channels, side, _ = observations.shape
-    pictures = observations.view(1, batch * channels, side, side).expand(headings, -1, -1, -1)
-    turned = F.grid_sample(pictures, _turned_cells(headings, side, observations), align_corners=True)
+    quarters = 4 if headings % 4 == 0 else 1  # quarter turns only move cells: a fourth of the sampling, or all of it
+    sampled = _turned_cells(headings, headings // quarters, side, observations)
+    pictures = observations.view(1, batch * channels, side, side).expand(len(sampled), -1, -1, -1)
+    part = F.grid_sample(pictures, sampled, align_corners=True)
+    turned = torch.cat([part.rot90(quarter, (3, 2)) for quarter in range(quarters)])
     return turned.view(headings, batch, channels, side, side).transpose(0, 1)
 
 
-def _turned_cells(headings: int, side: int, like: Tensor) -> Tensor:
-    """Where each cell of a turned observation comes from, in units of half its side: (R, h, h, 2), x and y."""
-    angle = torch.arange(headings, dtype=like.dtype, device=like.device).mul(math.tau / headings)[:, None, None]
+def _turned_cells(headings: int, first: int, side: int, like: Tensor) -> Tensor:
+    """Where each cell of an observation at the first of R headings comes from, in units of half its side:
+    (first, h, h, 2), x and y."""
+    angle = torch.arange(first, dtype=like.dtype, device=like.device).mul(math.tau / headings)[:, None, None]
     offset = torch.linspace(-1, 1, side, dtype=like.dtype, device=like.device)
     x, y = offset[None, None, :], offset[None, :, None]
     cosine, sine = angle.cos(), angle.sin()
