@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semslam.bench.results import Conditions, MapResult, NotRun, Results, Trained
-from semslam.bench.rows import ALL, CONVLSTM, MAP_METHODS, SETTINGS, protocols_of
+from semslam.bench.rows import ALL, CONVLSTM, MAP_METHODS, SETTINGS, VISUAL_SETTINGS, protocols_of
 from semslam.bench.tracks import TrackScore
 from semslam.geometry.frames import SE2
 from semslam.geometry.grid import to_sparse
@@ -145,7 +145,9 @@ _LEVELS = {
     "visual_inertial": (0.3, 8.0, 2),
     "visual_inertial_leaky": (0.4, 9.0, 0),
     "small_gicp": (0.04, 0.5, 0),
+    "visual_leaky": (2.4, 60.0, 0),
     **{row.name: (0.5, 9.5, 0) for row in SETTINGS},
+    **{row.name: (3.4, 62.0, 0) for row in VISUAL_SETTINGS},
 }
 """Made-up errors in metres and degrees, and seeds."""
 
@@ -193,6 +195,7 @@ def _maps(method: str, quality: str, seed: int, rng: np.random.Generator, drives
         f"log_{drive}": {
             "mse": {name: (level * rng.gamma(400.0, 1 / 400, steps)).tolist() for name in sets},
             "last": dict.fromkeys(sets, last),
+            "found": [None, *([level * step, 10.0] for step in range(2, steps))],
             "overlaps": {"intersection": [5, 40, 3, 2 + drive, *[0] * 11], "union": [9, 50, 6, 10, *[0] * 11]},
         }
         for drive in range(drives)

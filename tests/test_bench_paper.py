@@ -130,6 +130,25 @@ def test_the_margin_names_the_best_heuristic() -> None:
         assert row[4:6] == ("yes", "5 of 5")
 
 
+def test_settings_are_told_for_both_methods() -> None:
+    """Each changed setting beside the method as configured; gates are for the visual-inertial one alone."""
+    inertial, visual = tables.settings_sheets(made_up_results())
+    assert inertial.rows[0][0] == visual.rows[0][0] == "as configured"
+    assert {"R = 8", 'gate "any"'} <= {row[0] for row in inertial.rows}
+    changes = {row[0]: row[2] for row in visual.rows}
+    assert 0.5 < float(changes["visual, R = 8"].split()[0]) < 1.5
+    assert not any("gate" in name for name in changes)
+
+
+def test_poses_are_looked_for_in_maps_of_true_poses() -> None:
+    """Errors of each quality; the keyframe in which nothing fitted is counted, not averaged."""
+    sheet = tables.found_sheet(made_up_results())
+    assert [row[0] for row in sheet.rows] == ["ConvLSTM", "leaky 0.1", "leaky 0.3", "leaky 0.7", "leaky 1.0"]
+    assert sheet.rows[0][1].startswith("0.07")  # 0.02 times the mean of 2, 3, 4, 5
+    assert {row[2].split()[0] for row in sheet.rows} == {"10.0"}
+    assert "80%" in sheet.notes[0]
+
+
 def test_classes_are_pooled_over_drives() -> None:
     """Cells of all maps together: chairs (2 + 3 + 4 + 5 + 6) / 50; classes in no map have no row."""
     sheet = tables.class_sheet(made_up_results(), "real")
@@ -223,6 +242,9 @@ def test_a_quick_bench_fills_every_table_and_goes_on(toy: Path) -> None:
     leaky = report.results.map_curves("leaky_0.3", "ideal")
     assert leaky.shape == (1, 2, 3)
     assert (leaky < 0.1).all()
+    again = report.results.found_again("leaky_0.3", "ideal", "ape_m")
+    assert again.shape == (1, 2)
+    assert (again < 0.6).all()  # two cells: the whole room around the robot was laid down in the first keyframe
     for row in ("dead_reckoning", "visual_inertial_leaky"):  # the logs' own noise: as through the pipeline
         own, piped = report.results.noise_poses(row, 1.0, "ape_m"), report.results.poses(row, "cross", "ape_m")
         assert own.tolist() == piped.tolist()

@@ -8,10 +8,14 @@ Three sets of cells are told apart, because no method knows a cell that no regio
     reached   inside the region of interest of some step so far: the main one
     visible   reached, and visible so far
     all       the whole map, where cells out of reach cost every method the same
+
+Before each update the observation is looked for in the map as it stands (equation 2): how well a pose is found again
+when all poses before it were right.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,17 +25,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semslam.errors import SemslamError
-from semslam.geometry.frames import SE2
+from semslam.geometry.frames import SE2, wrap_angle
 from semslam.geometry.grid import Planes
 from semslam.map_metrics import Ids, Mask, class_overlaps, labels_of, map_mse, score_map
 from semslam.models.training.drives import Drive, DriveSet, RunTables
-from semslam.slam.paper import PoseGrid, Window, place_observation, pose_field, roi_mask, rotate_observation
+from semslam.slam.paper import (
+    PoseGrid,
+    Window,
+    best_bin,
+    correlate,
+    place_observation,
+    pose_field,
+    roi_mask,
+    rotate_observation,
+)
 from semslam.slam.paper_estimator import open_map
 from semslam.stages.settings import PaperConfig
 
 CELL_SETS = ("reached", "visible", "all")
 TASK = "semslam.bench.maps:build"
-VERSION = 1
+VERSION = 2
 """Raise it whenever the same part would come out differently."""
 
 
@@ -39,6 +52,8 @@ VERSION = 1
 class Laid:
     """One step: what is placed where, and what would be right."""
 
+    rotated: Planes
+    """(R, L, h, h)"""
     placed: Planes
     """(L, rows, columns)"""
     window: Window
@@ -76,9 +91,12 @@ def _one(
     """Scores of every step and of the last map of one drive, cells of its classes in both maps, and its panels."""
     world = open_map(paper, classes, Path(paper.model) if paper.update == "learned" else None)
     curves: dict[str, list[float | None]] = {name: [] for name in CELL_SETS}
+    found: list[tuple[float, float] | None] = []
     panels = []
     laid = None
     for step, laid in enumerate(steps_of(drive, paper, steps)):
+        if step:
+            found.append(_found_again(laid.rotated, world.planes, drive, step, paper))
         before = labels_of(world.planes) if step in wanted else None
         world.update(laid.placed, laid.window)
         for name, cells in _cell_sets(laid).items():
@@ -91,7 +109,24 @@ def _one(
     last = {name: {key: _number(value) for key, value in values.items()} for name, values in scores.items()}
     overlaps = class_overlaps(labels_of(world.planes), laid.truth, len(classes), laid.reached)
     pooled = {"intersection": overlaps.intersection.tolist(), "union": overlaps.union.tolist()}
-    return {"mse": curves, "last": last, "overlaps": pooled}, panels
+    return {"mse": curves, "last": last, "overlaps": pooled, "found": found}, panels
+
+
+def _found_again(
+    rotated: Planes, world: Planes, drive: Drive, step: int, paper: PaperConfig
+) -> tuple[float, float] | None:
+    """Metres and degrees between the visual pose (equation 2) and the true one; None if nothing fits anywhere.
+
+    Of poses that fit equally well the one nearest to the true pose of the step before counts.
+    """
+    scores = correlate(rotated, world)
+    if scores.max() <= 0.0:
+        return None
+    grid = PoseGrid(paper.headings, paper.map_side, paper.cell_m)
+    before, true = (SE2(*drive.poses[at].tolist()) for at in (step - 1, step))
+    pose = grid.pose_of(best_bin(scores, before, grid))
+    turned = math.degrees(abs(wrap_angle(pose.heading_rad - true.heading_rad)))
+    return math.hypot(pose.x_m - true.x_m, pose.y_m - true.y_m), turned
 
 
 def steps_of(drive: Drive, paper: PaperConfig, steps: int) -> Iterator[Laid]:
@@ -106,9 +141,10 @@ def steps_of(drive: Drive, paper: PaperConfig, steps: int) -> Iterator[Laid]:
     for step, planes in enumerate(drive.observations[:steps]):
         pose = SE2(*drive.poses[step].tolist())
         window = roi_mask(pose, grid, paper.side)
-        placed = place_observation(rotate_observation(planes, paper.headings), pose_field(pose, grid), window)
+        rotated = rotate_observation(planes, paper.headings)
+        placed = place_observation(rotated, pose_field(pose, grid), window)
         reached[window] = True
-        yield Laid(placed, window, drive.visible(step), reached.copy())
+        yield Laid(rotated, placed, window, drive.visible(step), reached.copy())
 
 
 def _cell_sets(laid: Laid) -> dict[str, Mask]:
@@ -148,6 +184,12 @@ def curve(result: Mapping[str, Any], logs: Sequence[str], cells: str) -> NDArray
     for row, values in zip(whole, curves, strict=True):
         row[: len(values)] = [np.nan if value is None else value for value in values]
     return whole
+
+
+def found_again(result: Mapping[str, Any], log: str) -> NDArray[np.float64]:
+    """(steps, 2) metres and degrees at every step of a log after its first; NaN where nothing fitted."""
+    rows = [(math.nan, math.nan) if one is None else one for one in result["logs"][log]["found"]]
+    return np.array(rows, np.float64).reshape(-1, 2)
 
 
 def paper_settings(paper: PaperConfig, **changes: Any) -> dict[str, Any]:

@@ -29,7 +29,7 @@ def train_networks(work: Work) -> Networks:
         wanted |= {(MAPPER, "cross", quality) for quality in QUALITIES}
     if work.with_noise:
         wanted |= {(ALL[name].network, "cross", "real") for name in NOISE_ROWS if ALL[name].network}
-    parts = {(*one, seed): _training(work, *one, seed) for one in sorted(wanted) for seed in work.seeds}
+    parts = {(*one, seed): _training(work, *one, seed) for seed in work.seeds for one in sorted(wanted)}
     if find_spec("torch") is None:
         reason = "torch is not installed: `pip install 'semslam[train]'`"
         return {name: Outcome(part, work.store.result(part), reason) for name, part in parts.items()}

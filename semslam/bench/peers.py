@@ -28,9 +28,11 @@ from semslam.tables.pictures import decode_colour, decode_depth
 from semslam.tables.spec import FRAMES, MOTION
 
 TASK = "semslam.bench.peers:track"
-VERSION = 1
+VERSION = 2
 TIMEOUT_S = 900.0
-_VOXEL_M, _REACH_M, _MAX_DEPTH_M, _NEIGHBOURS = 0.1, 0.5, 6.0, 20
+_VOXEL_M, _REACH_M, _MAX_DEPTH_M, _NEIGHBOURS = 0.1, 0.3, 6.0, 20
+"""Settings of small_gicp: of reaches of 0.2, 0.3 and 0.5 m and voxels of 0.05 and 0.1 m the best over three drives
+that train. kiss-icp shares depth and voxels."""
 
 Matrix = NDArray[np.float64]
 

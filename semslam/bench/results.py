@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.bench.maps import curve
+from semslam.bench.maps import curve, found_again
 from semslam.bench.tracks import TrackScore
 from semslam.map_metrics import Overlaps
 
@@ -136,6 +136,19 @@ class Results:
         found = self.of_method(method, quality)
         values = [[one.values["logs"][log]["last"][cells][what] for log in sorted(one.values["logs"])] for one in found]
         return np.array(values, np.float64).reshape(len(found), -1)
+
+    def found_again(self, method: str, quality: str, what: str) -> _FLOATS:
+        """(seeds, logs) of `ape_m`, `de_deg` or `coverage` of visual poses in maps that were built at true poses."""
+        found = self.of_method(method, quality)
+        errors = [[found_again(one.values, log) for log in sorted(one.values["logs"])] for one in found]
+        if not errors:
+            return np.zeros((0, 0))
+        if what == "coverage":
+            values = [[float(np.mean(~np.isnan(log[:, 0]))) for log in logs] for logs in errors]
+        else:
+            column = ("ape_m", "de_deg").index(what)
+            values = [[float(mean_over(log[:, column], 0)) for log in logs] for logs in errors]
+        return np.array(values, np.float64)
 
     def class_iou(self, method: str, quality: str) -> dict[str, float]:
         """Intersection over union of each class, cells of all last maps together; NaN for classes in none."""

@@ -63,13 +63,17 @@ def _learned(name: str, title: str, estimator: str, network: str) -> Row:
     return Row(name, title, estimator, _LEARNED, network, f"{_PAPER}.model")
 
 
-def _variant(name: str, title: str, **settings: Any) -> Row:
-    return Row(name, title, "paper", {f"{_PAPER}.{key}": value for key, value in settings.items()})
+def _variant(name: str, title: str, estimator: str = "paper", **settings: Any) -> Row:
+    return Row(name, title, estimator, {f"{_PAPER}.{key}": value for key, value in settings.items()})
 
 
 CHANCE = Row("chance", "Chance", note="uniform poses on the map, mean of many draws")
 STANDSTILL = Row("standstill", "Standing still", note="the first pose for ever")
 DEAD_RECKONING = Row("dead_reckoning", "Dead reckoning", "dead_reckoning", note="the motion u_t alone")
+
+_VISUAL_FAR = _variant("visual_leaky_h_33", "Visual, leaky map, h = 33", "paper_visual", side=33)
+_INERTIAL_FAR = _variant("visual_inertial_leaky_h_33", "Visual-inertial, leaky map, h = 33", side=33)
+"""With a view of 33 cells, nearly 5 m ahead, where the paper's text has 11, which are 1.65 m."""
 
 TABLE_1 = (
     CHANCE,
@@ -82,6 +86,8 @@ TABLE_1 = (
     _learned("visual_inertial", "SemanticSLAM, visual-inertial", "paper", MAPPER),
     Row("visual_leaky", "Visual, leaky map", "paper_visual", note="equation 10 in the place of the ConvLSTM"),
     Row("visual_inertial_leaky", "Visual-inertial, leaky map", "paper", note="likewise"),
+    _VISUAL_FAR,
+    _INERTIAL_FAR,
     Row("small_gicp", "small_gicp, scan to map", peer="small_gicp", note="motion and geometry, no semantics"),
     Row("kiss_icp", "kiss-icp", peer="kiss_icp", note="depth as a scan, no motion"),
     Row("pyorbslam3", "pyorbslam3", peer="pyorbslam3"),
@@ -90,23 +96,37 @@ ABLATION = ("mapnet", "semantic_cell", "visual", "visual_inertial")
 """Rows of the ablation in their order: each adds one thing to the one before."""
 ABLATION_TITLES = ("MapNet", "+ semantic observations", "+ ConvLSTM", "+ IMU")
 _ABLATION_ONLY = (_learned("semantic_cell", "Visual, LSTM a cell", "paper_visual", MAPPER_CELL),)
+
+
+def _changed(name: str, title: str, **settings: Any) -> tuple[Row, Row]:
+    """One setting changed, in the visual-inertial method and in the visual one."""
+    return _variant(name, title, **settings), _variant(f"visual_{name}", f"visual, {title}", "paper_visual", **settings)
+
+
+_BOTH = (
+    (_INERTIAL_FAR, _VISUAL_FAR),
+    _changed("r_8", "R = 8", headings=8),
+    _changed("r_120", "R = 120", headings=120),
+    _changed("binary", "binary observations", binary=True),
+    _changed("temperature", "temperature 0.1", temperature=0.1),
+    _changed("leak_0.1", "leaky 0.1", leak=0.1),
+)
 SETTINGS = (
     _variant("gate_any", 'gate "any"', gate="any"),
     _variant("gates_double", "gates twice as wide", gate_distance_m=0.6, gate_heading_rad=0.2),
     _variant("gates_open", "gates open", gate_distance_m=1e6, gate_heading_rad=3.2),
-    _variant("h_33", "h = 33 cells", side=33),
-    _variant("r_8", "R = 8", headings=8),
-    _variant("r_120", "R = 120", headings=120),
-    _variant("binary", "binary observations", binary=True),
-    _variant("temperature", "temperature 0.1", temperature=0.1),
+    *(inertial for inertial, _ in _BOTH),
 )
 """The visual-inertial method with a leaky map, one setting changed at a time: where its error comes from."""
 SETTINGS_BASE = "visual_inertial_leaky"
+VISUAL_SETTINGS = tuple(visual for _, visual in _BOTH)
+"""The visual method, likewise; it has no gates."""
+VISUAL_SETTINGS_BASE = "visual_leaky"
 
 NOISE_ROWS = ("dead_reckoning", "visual_inertial", "visual_inertial_leaky")
 """Rows that use the motion."""
-CROSS_ONLY = frozenset(row.name for row in (*_ABLATION_ONLY, *SETTINGS))
-ALL = {row.name: row for row in (*TABLE_1, *_ABLATION_ONLY, *SETTINGS)}
+ALL = {row.name: row for row in (*TABLE_1, *_ABLATION_ONLY, *SETTINGS, *VISUAL_SETTINGS)}
+CROSS_ONLY = frozenset(ALL) - {row.name for row in TABLE_1}
 
 
 def protocols_of(row: Row) -> tuple[str, ...]:

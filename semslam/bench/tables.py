@@ -31,6 +31,9 @@ from semslam.bench.rows import (
     SETTINGS,
     SETTINGS_BASE,
     TABLE_1,
+    VISUAL_SETTINGS,
+    VISUAL_SETTINGS_BASE,
+    Row,
 )
 from semslam.bench.statistics import Interval, interval, paired
 from semslam.pipeline.files import write_text
@@ -66,7 +69,8 @@ def sheets(results: Results) -> list[Sheet]:
         margin_sheet(results),
         quality_sheet(results),
         *(class_sheet(results, quality) for quality in QUALITIES),
-        settings_sheet(results),
+        *settings_sheets(results),
+        found_sheet(results),
         noise_sheet(results),
         missing_sheet(results),
     ]
@@ -278,21 +282,50 @@ def class_sheet(results: Results, quality: str) -> Sheet:
 _LAST = ("object_iou", "boundary_f1", "brier", "ece")
 
 
-def settings_sheet(results: Results) -> Sheet:
-    """The visual-inertial method with one setting changed at a time."""
-    names = rows_in(results, [SETTINGS_BASE, *(row.name for row in SETTINGS)])
+def settings_sheets(results: Results) -> Iterator[Sheet]:
+    """The visual-inertial method and the visual one with one setting changed at a time."""
+    told = "leaky map, cross-scene, one setting changed"
+    yield _settings_sheet(results, "settings", f"visual-inertial, {told}", SETTINGS_BASE, SETTINGS)
+    yield _settings_sheet(results, "settings_visual", f"visual, {told}", VISUAL_SETTINGS_BASE, VISUAL_SETTINGS)
+
+
+def _settings_sheet(results: Results, name: str, title: str, base: str, changed: Sequence[Row]) -> Sheet:
+    names = rows_in(results, [base, *(row.name for row in changed)])
     rows = []
-    for name in names if len(names) > 1 else []:
-        ape, de = (results.poses(name, "cross", what) for what in ("ape_m", "de_deg"))
-        base = results.poses(SETTINGS_BASE, "cross", "ape_m")
-        change = "" if name == SETTINGS_BASE or not (ape.size and base.size) else _change(ape, base)
-        title = "as configured" if name == SETTINGS_BASE else ALL[name].title
-        rows.append((title, _with_interval(interval(ape), 2), change, _with_interval(interval(de), 1)))
+    for one in names if len(names) > 1 else []:
+        ape, de = (results.poses(one, "cross", what) for what in ("ape_m", "de_deg"))
+        usual = results.poses(base, "cross", "ape_m")
+        change = "" if one == base or not (ape.size and usual.size) else _change(ape, usual)
+        setting = "as configured" if one == base else ALL[one].title
+        rows.append((setting, _with_interval(interval(ape), 2), change, _with_interval(interval(de), 1)))
     return Sheet(
-        "settings",
-        "Where the error comes from: visual-inertial, leaky map, cross-scene, one setting changed",
-        ("setting", "APE, m", "change, paired", "DE, deg"),
+        name, f"Where the error comes from: {title}", ("setting", "APE, m", "change, paired", "DE, deg"), tuple(rows)
+    )
+
+
+def found_sheet(results: Results) -> Sheet:
+    """How well a pose is found again when all poses before it were right."""
+    head = ["map"]
+    for quality in QUALITIES:
+        head += [f"{QUALITY_TITLES[quality]}: APE, m", "DE, deg"]
+    rows = []
+    for method in MAP_METHODS:
+        found = [[interval(results.found_again(method, q, what)) for what in ("ape_m", "de_deg")] for q in QUALITIES]
+        if any(one.known for pair in found for one in pair):
+            cells = [_with_interval(one, digits) for pair in found for one, digits in zip(pair, (2, 1), strict=True)]
+            rows.append((MAP_TITLES[method], *cells))
+    shares = [interval(results.found_again(m, q, "coverage")) for m in MAP_METHODS for q in QUALITIES]
+    least = min((one.mean for one in shares if one.known), default=math.nan)
+    return Sheet(
+        "found_again",
+        "Visual poses in maps built at true poses, cross-scene",
+        tuple(head),
         tuple(rows),
+        (
+            "Equation 2 alone, on a whole map, when no pose before it was wrong: what is left of the error of the "
+            f"visual method without the damage that its own poses do to its map. Something fitted in {least:.0%} of "
+            "the keyframes or more.",
+        ),
     )
 
 
