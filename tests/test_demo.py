@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from semslam.errors import SemslamError
-from semslam.labels import FIRST_OBJECT
+from semslam.labels import FIRST_OBJECT, FREE_FLOOR, UNOBSERVED, class_list
 from semslam.logs.decode import decoder_for
 from semslam.logs.images import decode_colour, decode_depth
 from semslam.logs.messages import CompressedImage
@@ -24,6 +24,8 @@ from semslam.models.detectors import Detector
 from semslam.models.segmenters import Segmenter, open_segmenter
 from semslam.pipeline import demo
 from semslam.sim.home import CLASSES
+from semslam.slam.learned_map import LearnedMap
+from semslam.stages.settings import PaperConfig
 
 CLEAR_PIXELS, MIN_SCORE, MIN_OVERLAP = 1500, 0.3, 0.5
 
@@ -107,7 +109,7 @@ def test_a_package_without_its_files_says_so(monkeypatch: pytest.MonkeyPatch, tm
     assert "pip install" in caught.value.hint
 
 
-@pytest.mark.parametrize("role", ["detector", "segmenter_encoder"])
+@pytest.mark.parametrize("role", ["detector", "segmenter_encoder", "map_update"])
 def test_shipped_models_have_cards_that_tell_the_truth(role: str) -> None:
     """A card names the digest of its file, and how to make it again."""
     path = _shipped(role)
@@ -121,6 +123,22 @@ def test_the_decoder_is_on_the_card_of_its_encoder() -> None:
     """The two were trained together and are of no use apart."""
     text = _shipped("segmenter_encoder").with_suffix(".md").read_text(encoding="utf-8")
     assert hashlib.sha256(_shipped("segmenter_decoder").read_bytes()).hexdigest() in text
+
+
+def test_the_shipped_map_update_fits_what_comes_out_of_the_box() -> None:
+    """Classes of the shipped detector, cells and side of the usual configuration; a chair that is seen stays."""
+    paper, classes = PaperConfig(), class_list(CLASSES)
+    world = LearnedMap.open(_shipped("map_update"), classes, paper.map_side, paper.cell_m, paper.side)
+    placed = np.zeros((len(classes), paper.side, paper.side), np.float32)
+    placed[FREE_FLOOR] = 1.0
+    placed[:, 7, 7] = 0.0
+    placed[classes.index("chair"), 7, 7] = 0.8
+    for _ in range(3):
+        world.update(placed, (slice(11, 22), slice(11, 22)))
+    found = world.planes.argmax(0)
+    assert classes[found[18, 18]] == "chair"
+    assert found[13, 13] == FREE_FLOOR
+    assert found[2, 2] == UNOBSERVED
 
 
 def test_all_shipped_models_together_are_small() -> None:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from semslam.bench.published import POSES
 from semslam.bench.results import MapResult, Results
-from semslam.bench.rows import ALL, CONVLSTM, MAP_METHODS, MAP_TITLES, PROTOCOLS, QUALITIES, QUALITY_TITLES, TABLE_1
+from semslam.bench.rows import ALL, CONVLSTM, MAP_METHODS, MAP_TITLES, PROTOCOLS, QUALITY_TITLES, SIGHTS, TABLE_1
 from semslam.bench.statistics import Interval, band, interval
 from semslam.labels import FREE_FLOOR, OBSTACLE, UNOBSERVED
 from semslam.pipeline.files import write_text
@@ -102,10 +102,7 @@ def write_figures(results: Results, folder: Path) -> dict[str, str]:
         *((f"errors_{p}", f"Error over time, {p}-scene", partial(error_over_time, results, p)) for p in PROTOCOLS),
         ("table1", "Table 1 as a picture", partial(table_1, results)),
         ("map_loss", "Map error over time at true poses", partial(map_loss, results)),
-        *(
-            (f"map_updates_{q}", f"Map updates, {QUALITY_TITLES[q]}", partial(map_updates, results, q))
-            for q in QUALITIES
-        ),
+        *((f"map_updates_{q}", f"Map updates, {QUALITY_TITLES[q]}", partial(map_updates, results, q)) for q in SIGHTS),
     ]
     written: dict[str, str] = {}
     for name, title, make in makers:
@@ -159,7 +156,7 @@ def error_over_time(results: Results, protocol: str) -> Figure | None:
 
 def map_loss(results: Results) -> Figure | None:
     """Mean squared error of the maps at every keyframe, one panel a quality."""
-    qualities = [q for q in QUALITIES if any(one.quality == q for one in results.maps)]
+    qualities = [q for q in SIGHTS if any(one.quality == q for one in results.maps)]
     if not qualities:
         return None
     figure, axes = _figure(1, len(qualities), width=3.4 * len(qualities) + 0.6, height=3.6, share=True)

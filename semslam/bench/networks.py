@@ -10,7 +10,7 @@ from typing import Any
 from semslam.bench import trainings
 from semslam.bench.jobs import Outcome
 from semslam.bench.results import Trained
-from semslam.bench.rows import ALL, DEEPVO, MAPNET, MAPPER, MAPPER_CELL, NOISE_ROWS, QUALITIES
+from semslam.bench.rows import ALL, DEEPVO, MAPNET, MAPPER, MAPPER_FAR, NOISE_ROWS, QUALITIES
 from semslam.bench.store import Part
 from semslam.bench.work import Work
 from semslam.tables.spec import FRAMES
@@ -26,7 +26,7 @@ def train_networks(work: Work) -> Networks:
     """Train every network that anything asked for needs; without torch there are none, and the reason."""
     wanted = {(row.network, p, "real") for row in work.rows if row.network for p in work.protocols(row)}
     if work.with_maps:
-        wanted |= {(MAPPER, "cross", quality) for quality in QUALITIES}
+        wanted |= {(MAPPER, "cross", quality) for quality in QUALITIES} | {(MAPPER_FAR, "cross", "real")}
     if work.with_noise:
         wanted |= {(ALL[name].network, "cross", "real") for name in NOISE_ROWS if ALL[name].network}
     parts = {(*one, seed): _training(work, *one, seed) for seed in work.seeds for one in sorted(wanted)}
@@ -63,8 +63,9 @@ def _training(work: Work, kind: str, protocol: str, quality: str, seed: int) -> 
     }
     facts: dict[str, Any] = {**shared, "version": trainings.VERSION}
     arguments: dict[str, Any] = {**shared, "dataset": str(work.dataset.root)}
-    if kind in (MAPPER, MAPPER_CELL):
-        own = {"quality": quality, "paper": work.paper(), "kernel": 3 if kind == MAPPER else 1}
+    if kind in trainings.MAPPERS:
+        paper = {**work.paper(), **trainings.MAPPERS[kind].paper}
+        own = {"quality": quality, "paper": paper}
         facts |= {**own, "inputs": work.inputs(logs, observed=quality == "real")}
         arguments |= {**own, "run": work.run_files(logs)}
     elif kind in (MAPNET, DEEPVO):

@@ -32,7 +32,8 @@ POSES: dict[tuple[str, str], PosePrint] = {
     ("visual_inertial", "cross"): PosePrint(2.39, 57.11),
     ("semantic_cell", "cross"): PosePrint(3.80, 80.50),
 }
-"""By row and protocol."""
+POSES |= {(f"{row}_h_33", protocol): one for (row, protocol), one in POSES.items() if row.startswith("visual")}
+"""By row and protocol. The text says h = 11, the authors' code 33: which of them was printed is not known."""
 
 UNPRINTED = {"orb_rgbd": "N/A"}
 """Rows that the paper has without figures, and what it prints for them."""
@@ -54,4 +55,5 @@ MAPS: dict[tuple[str, str], MapPrint] = {
     ("leaky_1.0", "obstructed"): MapPrint(4.35, 0.41),
     ("leaky_1.0", "ideal"): MapPrint(6.65, 0.59),
 }
-"""By method and quality of observations."""
+MAPS |= {(method, "real_h_33"): one for (method, quality), one in MAPS.items() if quality == "real"}
+"""By method and what the maps were built from; likewise."""

@@ -39,7 +39,7 @@ class Conditions:
 
 @dataclass(frozen=True)
 class MapResult:
-    """Maps of one method from observations of one quality, as `maps.build` gives them."""
+    """Maps of one method, as `maps.build` gives them; `quality` is one of `SIGHTS`."""
 
     method: str
     quality: str

@@ -14,6 +14,11 @@ from semslam.errors import UsageError
 
 PROTOCOLS = ("intra", "cross")
 QUALITIES = ("real", "obstructed", "ideal")
+FAR_SIDE = 33
+"""Cells along a side of the view in the authors' code, nearly 5 m ahead; the paper's text has 11, which are 1.65 m."""
+FAR = f"real_h_{FAR_SIDE}"
+SIGHTS = (*QUALITIES, FAR)
+"""What maps are built from: observations of each quality, and of the real camera with the wide view."""
 LEAKS = (0.1, 0.3, 0.7, 1.0)
 CONVLSTM = "convlstm"
 NOISE_LEVELS = (0.0, 0.5, 1.0, 3.0)
@@ -24,6 +29,8 @@ MAPPER = "mapper"
 """The map update by ConvLSTM, 3 x 3 (equation 8)."""
 MAPPER_CELL = "mapper_cell"
 """The same with an LSTM a cell, as MapNet has it."""
+MAPPER_FAR = f"mapper_h_{FAR_SIDE}"
+"""The 3 x 3 one for the wide view; it learns at true poses alone, since finding its own takes too long."""
 MAPNET, DEEPVO = "mapnet", "deepvo"
 
 
@@ -59,8 +66,9 @@ _PAPER = "localize.paper"
 _LEARNED = {f"{_PAPER}.update": "learned"}
 
 
-def _learned(name: str, title: str, estimator: str, network: str) -> Row:
-    return Row(name, title, estimator, _LEARNED, network, f"{_PAPER}.model")
+def _learned(name: str, title: str, estimator: str, network: str, **settings: Any) -> Row:
+    changed = {f"{_PAPER}.{key}": value for key, value in settings.items()}
+    return Row(name, title, estimator, {**_LEARNED, **changed}, network, f"{_PAPER}.model")
 
 
 def _variant(name: str, title: str, estimator: str = "paper", **settings: Any) -> Row:
@@ -71,9 +79,8 @@ CHANCE = Row("chance", "Chance", note="uniform poses on the map, mean of many dr
 STANDSTILL = Row("standstill", "Standing still", note="the first pose for ever")
 DEAD_RECKONING = Row("dead_reckoning", "Dead reckoning", "dead_reckoning", note="the motion u_t alone")
 
-_VISUAL_FAR = _variant("visual_leaky_h_33", "Visual, leaky map, h = 33", "paper_visual", side=33)
-_INERTIAL_FAR = _variant("visual_inertial_leaky_h_33", "Visual-inertial, leaky map, h = 33", side=33)
-"""With a view of 33 cells, nearly 5 m ahead, where the paper's text has 11, which are 1.65 m."""
+_VISUAL_FAR = _variant("visual_leaky_h_33", "Visual, leaky map, h = 33", "paper_visual", side=FAR_SIDE)
+_INERTIAL_FAR = _variant("visual_inertial_leaky_h_33", "Visual-inertial, leaky map, h = 33", side=FAR_SIDE)
 
 TABLE_1 = (
     CHANCE,
@@ -84,6 +91,8 @@ TABLE_1 = (
     Row("orb_rgbd", "ORB RGB-D", "orb_rgbd"),
     _learned("visual", "SemanticSLAM, visual", "paper_visual", MAPPER),
     _learned("visual_inertial", "SemanticSLAM, visual-inertial", "paper", MAPPER),
+    _learned("visual_h_33", "SemanticSLAM, visual, h = 33", "paper_visual", MAPPER_FAR, side=FAR_SIDE),
+    _learned("visual_inertial_h_33", "SemanticSLAM, visual-inertial, h = 33", "paper", MAPPER_FAR, side=FAR_SIDE),
     Row("visual_leaky", "Visual, leaky map", "paper_visual", note="equation 10 in the place of the ConvLSTM"),
     Row("visual_inertial_leaky", "Visual-inertial, leaky map", "paper", note="likewise"),
     _VISUAL_FAR,
@@ -110,6 +119,7 @@ _BOTH = (
     _changed("binary", "binary observations", binary=True),
     _changed("temperature", "temperature 0.1", temperature=0.1),
     _changed("leak_0.1", "leaky 0.1", leak=0.1),
+    _changed("h_33_leak_0.1", "h = 33, leaky 0.1", side=FAR_SIDE, leak=0.1),
 )
 SETTINGS = (
     _variant("gate_any", 'gate "any"', gate="any"),
@@ -123,7 +133,7 @@ VISUAL_SETTINGS = tuple(visual for _, visual in _BOTH)
 """The visual method, likewise; it has no gates."""
 VISUAL_SETTINGS_BASE = "visual_leaky"
 
-NOISE_ROWS = ("dead_reckoning", "visual_inertial", "visual_inertial_leaky")
+NOISE_ROWS = ("dead_reckoning", "visual_inertial", "visual_inertial_leaky", "visual_inertial_h_33")
 """Rows that use the motion."""
 ALL = {row.name: row for row in (*TABLE_1, *_ABLATION_ONLY, *SETTINGS, *VISUAL_SETTINGS)}
 CROSS_ONLY = frozenset(ALL) - {row.name for row in TABLE_1}
@@ -153,4 +163,9 @@ def leaky_name(leak: float) -> str:
 
 MAP_METHODS = (CONVLSTM, *map(leaky_name, LEAKS))
 MAP_TITLES = {CONVLSTM: "ConvLSTM", **{leaky_name(leak): f"leaky {leak:.1f}" for leak in LEAKS}}
-QUALITY_TITLES = {"real": "real camera", "obstructed": "obstructed", "ideal": "ideal"}
+QUALITY_TITLES = {
+    "real": "real camera",
+    "obstructed": "obstructed",
+    "ideal": "ideal",
+    FAR: f"real camera, h = {FAR_SIDE}",
+}

@@ -26,10 +26,10 @@ from semslam.bench.rows import (
     NOISE_LEVELS,
     NOISE_ROWS,
     PROTOCOLS,
-    QUALITIES,
     QUALITY_TITLES,
     SETTINGS,
     SETTINGS_BASE,
+    SIGHTS,
     TABLE_1,
     VISUAL_SETTINGS,
     VISUAL_SETTINGS_BASE,
@@ -68,7 +68,7 @@ def sheets(results: Results) -> list[Sheet]:
         *(map_sheet(results, cells) for cells in CELL_SETS),
         margin_sheet(results),
         quality_sheet(results),
-        *(class_sheet(results, quality) for quality in QUALITIES),
+        *(class_sheet(results, quality) for quality in SIGHTS),
         *settings_sheets(results),
         found_sheet(results),
         noise_sheet(results),
@@ -181,7 +181,7 @@ _SETS = {
 def map_sheet(results: Results, cells: str) -> Sheet:
     """Table 4 of the paper: map error at true poses, over a set of cells."""
     head = ["method"]
-    for quality in QUALITIES:
+    for quality in SIGHTS:
         head += [f"{QUALITY_TITLES[quality]}, published", "here"]
     rows = tuple((MAP_TITLES[m], *_map_cells(results, m, cells)) for m in MAP_METHODS if _wanted(results, m))
     return Sheet(
@@ -201,7 +201,7 @@ def _wanted(results: Results, method: str) -> bool:
 
 
 def _map_cells(results: Results, method: str, cells: str) -> Iterator[str]:
-    for quality in QUALITIES:
+    for quality in SIGHTS:
         printed = MAPS[method, quality]
         yield f"{printed.mse_x100:.2f} +- {printed.deviation:.2f}"
         yield _with_interval(_scaled(interval(results.map_errors(method, quality, cells)), _PER_CENT), 2)
@@ -209,7 +209,7 @@ def _map_cells(results: Results, method: str, cells: str) -> Iterator[str]:
 
 def margin_sheet(results: Results) -> Sheet:
     """ConvLSTM against the best heuristic of each quality."""
-    rows = tuple(row for quality in QUALITIES for row in _margin_row(results, quality))
+    rows = tuple(row for quality in SIGHTS for row in _margin_row(results, quality))
     return Sheet(
         "table4_margin",
         "Table 4: ConvLSTM against the best heuristic, cells reached",
@@ -242,7 +242,7 @@ def _margin_row(results: Results, quality: str) -> Iterator[tuple[str, ...]]:
 def quality_sheet(results: Results) -> Sheet:
     """What else can be said of the last maps."""
     rows = []
-    for quality in QUALITIES:
+    for quality in SIGHTS:
         for method in MAP_METHODS:
             if results.of_method(method, quality):
                 found = [interval(results.map_scores(method, quality, what)) for what in _LAST]
@@ -306,15 +306,15 @@ def _settings_sheet(results: Results, name: str, title: str, base: str, changed:
 def found_sheet(results: Results) -> Sheet:
     """How well a pose is found again when all poses before it were right."""
     head = ["map"]
-    for quality in QUALITIES:
+    for quality in SIGHTS:
         head += [f"{QUALITY_TITLES[quality]}: APE, m", "DE, deg"]
     rows = []
     for method in MAP_METHODS:
-        found = [[interval(results.found_again(method, q, what)) for what in ("ape_m", "de_deg")] for q in QUALITIES]
+        found = [[interval(results.found_again(method, q, what)) for what in ("ape_m", "de_deg")] for q in SIGHTS]
         if any(one.known for pair in found for one in pair):
             cells = [_with_interval(one, digits) for pair in found for one, digits in zip(pair, (2, 1), strict=True)]
             rows.append((MAP_TITLES[method], *cells))
-    shares = [interval(results.found_again(m, q, "coverage")) for m in MAP_METHODS for q in QUALITIES]
+    shares = [interval(results.found_again(m, q, "coverage")) for m in MAP_METHODS for q in SIGHTS]
     least = min((one.mean for one in shares if one.known), default=math.nan)
     return Sheet(
         "found_again",

@@ -8,16 +8,33 @@ network's file. torch is imported by what this calls and by nothing else of the 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from semslam.bench.rows import DEEPVO, MAPNET, MAPPER, MAPPER_CELL
+from semslam.bench.rows import DEEPVO, FAR_SIDE, MAPNET, MAPPER, MAPPER_CELL, MAPPER_FAR
 from semslam.models.extras import require_torch
 
 TASK = "semslam.bench.trainings:train"
-VERSION = 1
+VERSION = 2
 """Raise it whenever the same training would come out differently."""
+
+
+@dataclass(frozen=True)
+class MapperKind:
+    """How a kind of map update differs from the usual one."""
+
+    paper: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the estimator that will use it."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    steps: int | None = None
+
+
+MAPPERS = {
+    MAPPER: MapperKind(),
+    MAPPER_CELL: MapperKind(options={"kernel": 1}),
+    MAPPER_FAR: MapperKind({"side": FAR_SIDE}, {"own_share": 0.0}, 300),
+}
 
 
 def train(arguments: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -38,7 +55,7 @@ def train(arguments: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _mapper(arguments: Mapping[str, Any], folder: Path) -> Path:
-    """The map update of equation 8: dataset, logs, quality, run, paper, kernel."""
+    """The map update of equation 8: dataset, logs, quality, run, paper."""
     from semslam.models.training.drives import DriveSet, RunTables
     from semslam.models.training.mapping import USUAL, MapperOptions, train_mapper
     from semslam.stages.settings import PaperConfig
@@ -46,10 +63,10 @@ def _mapper(arguments: Mapping[str, Any], folder: Path) -> Path:
     paper = PaperConfig(**arguments["paper"])
     run = {log: RunTables(*(tuple(map(Path, files)) for files in both)) for log, both in arguments["run"].items()}
     drives = DriveSet.open(Path(arguments["dataset"]), arguments["logs"], arguments["quality"], run=run, paper=paper)
-    options = MapperOptions(paper=paper, kernel=arguments["kernel"])
-    return train_mapper(
-        drives, folder, schedule=_schedule(USUAL, arguments), options=options, device=arguments["device"]
-    )
+    kind = MAPPERS[arguments["kind"]]
+    options = MapperOptions(paper=paper, **kind.options)
+    schedule = _schedule(replace(USUAL, steps=kind.steps or USUAL.steps), arguments)
+    return train_mapper(drives, folder, schedule=schedule, options=options, device=arguments["device"])
 
 
 def _mapnet(arguments: Mapping[str, Any], folder: Path) -> Path:
@@ -73,8 +90,7 @@ def _deepvo(arguments: Mapping[str, Any], folder: Path) -> Path:
 
 
 _ADAPTERS: dict[str, Callable[[Mapping[str, Any], Path], Path]] = {
-    MAPPER: _mapper,
-    MAPPER_CELL: _mapper,
+    **dict.fromkeys(MAPPERS, _mapper),
     MAPNET: _mapnet,
     DEEPVO: _deepvo,
 }

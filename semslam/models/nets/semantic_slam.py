@@ -30,6 +30,9 @@ from semslam.labels import FIRST_OBJECT, UNOBSERVED
 
 START = 0.9
 """Hidden state of a cell that nothing updated yet: this for *unobserved*, minus this for all other classes."""
+_NOISE, _WHOLE, _OBJECT = 0.3, 4.0, 12.0
+"""Share of the usual random weights, and how strongly floor or obstacles and objects are written down at first: an
+object's weights are shares of its pixels, most of them below 0.3."""
 _KAPPA = 5.0
 """Steepness of the read-out before training: an untouched cell is *unobserved* with 99.8 %."""
 
@@ -240,7 +243,26 @@ class MapUpdate(nn.Module):
         self.peepholes = nn.Parameter(torch.zeros(3, classes, 1, 1))
         self.log_kappa = nn.Parameter(torch.tensor(math.log(_KAPPA)))
         with torch.no_grad():
-            self.gates.bias[classes : 2 * classes] += 1.0  # remember, until there is a reason to forget
+            self._begin()
+
+    def _begin(self) -> None:
+        """Start out writing down what was placed: rare classes would otherwise take long to be noticed at all.
+
+        A cell takes up each class that was placed on it, for it and against all others, and is kept where nothing was
+        placed. Around this the weights are random, as usual but smaller.
+        """
+        strength = torch.full((self.classes,), _OBJECT)
+        strength[:FIRST_OBJECT], strength[UNOBSERVED] = _WHOLE, 0.0
+        middle = self.kernel // 2
+        placed = self.gates.weight.mul_(_NOISE)[:, : self.classes, middle, middle]
+        into, keep, candidate, _ = placed.split(self.classes)  # (L, L) each, views
+        into += strength
+        keep -= strength
+        candidate += torch.diag(2 * strength) - strength
+        into, keep, _, out = self.gates.bias.mul_(_NOISE).split(self.classes)
+        into -= 3.0
+        keep += 4.0
+        out += 2.0
 
     @property
     def halo(self) -> int:

@@ -76,6 +76,12 @@ class Sights:
         result.reshape(len(self.seen), -1)[step, self.cells] = self.weights
         return result
 
+    def first(self, keyframes: int) -> Sights:
+        """Those of the first keyframes alone."""
+        end = self.starts[: keyframes + 1][-1]
+        starts = self.starts[: keyframes + 1]
+        return Sights(self.shape, self.seen[:keyframes], starts, self.cells[:end], self.weights[:end])
+
     def mirrored(self) -> Sights:
         """Left is right."""
         side = np.uint32(self.shape[2])
@@ -355,6 +361,16 @@ def _require_equal(read: Sequence[tuple[Drive, tuple[str, ...]]]) -> None:
                 details=f"{first.name}: {', '.join(classes)}\n{drive.name}: {', '.join(others)}",
                 hint="run all logs with one configuration",
             )
+
+
+def shortened(drive: Drive, keyframes: int) -> Drive:
+    """The beginning of the drive; cells that are visible later only are then visible to no step."""
+    return replace(
+        drive,
+        sights=drive.sights.first(keyframes),
+        motion=drive.motion[:keyframes],
+        poses=drive.poses[:keyframes],
+    )
 
 
 def mirrored(drive: Drive) -> Drive:

@@ -41,7 +41,7 @@ from semslam.models.nets.semantic_slam import (
     start_state,
     update_map,
 )
-from semslam.models.training.drives import Drive, DriveSet, mirrored, turned
+from semslam.models.training.drives import Drive, DriveSet, mirrored, shortened, turned
 from semslam.models.training.export import export_onnx
 from semslam.models.training.trainer import Progress, Schedule, fit
 from semslam.stages.settings import PaperConfig
@@ -70,6 +70,9 @@ class MapperOptions:
     (5 degrees) lies within the gate of equation 4."""
     truncate: int = 10
     """Steps through which gradients flow back."""
+    length: int | None = 40
+    """Keyframes of a drive that are learned from, from its start; None takes all. Most of a map is made in its first
+    half, and half the keyframes take half the time."""
 
     @property
     def matching(self) -> Matching:
@@ -297,7 +300,8 @@ def train_mapper(
     """
     chosen = options_for(drives, options)
     network = new_map_update(len(drives.classes), chosen.kernel, schedule.seed).to(torch.device(device))
-    batches = DriveBatches(drives.drives, chosen, schedule.steps, schedule.batch, schedule.seed)
+    learned = [shortened(one, chosen.length) if chosen.length else one for one in drives.drives]
+    batches = DriveBatches(learned, chosen, schedule.steps, schedule.batch, schedule.seed)
     facts = {"task": "mapper", "classes": list(drives.classes), "data": drives.digest, "options": _facts(chosen)}
     trained = fit(network, partial(mapping_loss, options=chosen), batches, schedule, out, facts=facts, watch=watch)
     export_map_update(map_update(trained), out / MAP_UPDATE, drives, chosen)
@@ -314,7 +318,7 @@ def options_for(drives: DriveSet, options: MapperOptions | None = None) -> Mappe
 
 def _facts(options: MapperOptions) -> dict[str, Any]:
     """What a training depends on; `update`, `leak` and `model` are of other estimators."""
-    facts = asdict(options)
+    facts = {name: value for name, value in asdict(options).items() if value is not None}
     for name in ("update", "leak", "model"):
         facts["paper"].pop(name, None)
     return facts
