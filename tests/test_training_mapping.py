@@ -16,13 +16,15 @@ pytest.importorskip("onnxscript", reason="needs the extra [train]")
 from semslam.errors import SemslamError  # noqa: E402
 from semslam.geometry.frames import SE2  # noqa: E402
 from semslam.geometry.grid import pool_observation  # noqa: E402
-from semslam.labels import UNOBSERVED  # noqa: E402
+from semslam.labels import FIRST_OBJECT, UNOBSERVED  # noqa: E402
+from semslam.models.nets.semantic_slam import update_map  # noqa: E402
 from semslam.models.training import mapping  # noqa: E402
 from semslam.models.training.drives import (  # noqa: E402
     DriveSet,
     coarse_observation,
     logs_of,
     mirrored,
+    shortened,
     turned,
 )
 from semslam.models.training.mapping import (  # noqa: E402
@@ -334,6 +336,35 @@ def test_a_killed_training_goes_on_to_the_same_bytes(
         train_mapper(drives, tmp_path / "cut", schedule=QUICK, options=MapperOptions(PAPER, kernel=1))
 
 
+def test_a_shortened_drive_is_the_drive_as_it_began(drives: DriveSet) -> None:
+    """The same observations, motion and poses, and the same map as far as it was visible by then."""
+    whole = drives.drives[0]
+    short = shortened(whole, 5)
+    assert len(short) == 5
+    assert np.array_equal(short.observations, whole.observations[:5])
+    assert np.array_equal(short.poses, whole.poses[:5])
+    assert np.array_equal(short.motion, whole.motion[:5], equal_nan=True)
+    assert np.array_equal(short.visible(4), whole.visible(4))
+    assert len(shortened(whole, 10_000)) == len(whole)
+
+
+def test_a_map_update_writes_down_what_it_sees_before_any_training() -> None:
+    """Every class, from weights as small as a share of an object; cells without anything stay unobserved."""
+    for seed in (1, 2):
+        fresh = new_map_update(6, 3, seed).eval()
+        placed = torch.zeros(1, 6, 7, 7)
+        placed[:, UNOBSERVED] = 1.0
+        placed[0, :, 3, 1:6] = 0.0
+        for label in range(1, 6):
+            placed[0, label, 3, label] = 1.0 if label < FIRST_OBJECT else 0.2
+        state = fresh.start(1, 7)
+        for _ in range(3):
+            state = update_map(fresh, placed, state, torch.tensor([[0, 3, 3]]), 7)
+        labels = state.hidden[0, :, :-1].argmax(0).view(7, 7)
+        assert labels[3].tolist() == [0, 1, 2, 3, 4, 5, 0]
+        assert not labels[[0, 1, 5, 6]].any()
+
+
 def test_the_command_trains_judges_and_writes_a_card(folder: Path, tmp_path: Path, capsys: Any) -> None:
     """`semslam train mapper` with the data set's own observations; without a run there is no real camera."""
     sizes = ["--side", str(SIDE), "--steps", "2", "--batch", "2", "--kernel", "1"]
@@ -344,6 +375,7 @@ def test_the_command_trains_judges_and_writes_a_card(folder: Path, tmp_path: Pat
     assert "| network |" in card
     assert "--quality ideal --protocol cross --kernel 1" in card
     assert "| poses | true ones alone |" in card
+    assert "| keyframes | the first 40 of each drive |" in card
     assert (tmp_path / "out" / "map_update.onnx").is_file()
     capsys.readouterr()
     assert run_command(["train", "mapper", str(folder), "--out", str(tmp_path / "real")], None) == 1

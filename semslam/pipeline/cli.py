@@ -698,6 +698,9 @@ def train_segmenter(**given: Any) -> int:
     click.option(
         "--own", type=click.FloatRange(0, 1), default=0.5, show_default=True, help="Share of own poses at the end."
     ),
+    click.option(
+        "--length", type=click.IntRange(2), default=40, show_default=True, help="Keyframes of a drive, from its start."
+    ),
 )
 def train_mapper(**given: Any) -> int:
     """Train the map update (equation 8) on the drives of DATASET and export it as ONNX.

@@ -27,6 +27,7 @@ class MapperRequest(DrivesRequest):
     side: int = 11
     binary: bool = False
     own: float = 0.5
+    length: int = 40
 
     @property
     def schedule(self) -> Schedule:
@@ -36,12 +37,14 @@ class MapperRequest(DrivesRequest):
     @property
     def options(self) -> MapperOptions:
         """What to train for."""
-        return MapperOptions(PaperConfig(side=self.side, binary=self.binary), int(self.kernel), self.own)
+        paper = PaperConfig(side=self.side, binary=self.binary)
+        return MapperOptions(paper, int(self.kernel), self.own, length=self.length)
 
     @property
     def command(self) -> str:
         """What to type to make it again, without folders of this machine."""
-        sizes = f"--kernel {self.kernel} --side {self.side}{' --binary' * self.binary} --own {self.own:g}"
+        sizes = f"--kernel {self.kernel} --side {self.side}{' --binary' * self.binary}"
+        sizes += f" --own {self.own:g} --length {self.length}"
         return self.typed("mapper", self.schedule, f"--quality {self.quality} --protocol {self.protocol} {sizes}")
 
 

@@ -319,6 +319,7 @@ def _mapped(run: Run, device: torch.device, drives: DriveSet, options: MapperOpt
         "kernel": options.kernel,
         "parameters": f"{parameters_of(new_map_update(classes, options.kernel, 0)):,}",
         "data": f"{len(drives)} drives of `{drives.origin}`, quality {drives.quality}, digest {drives.digest}",
+        "keyframes": f"the first {options.length} of each drive" if options.length else "all",
         "poses": _posed(options),
         **_asked_for(run, device, "drives"),
     }
