@@ -79,6 +79,8 @@ _METHODS: dict[str, _Line] = {
     "orb_rgbd": _Line("#009E73"),
     "visual": _Line("#56B4E9", label="visual"),
     "visual_inertial": _Line("#0072B2", width=2.6, label="visual-inertial"),
+    "visual_h_33": _Line("#56B4E9", "--", label="visual, h = 33"),
+    "visual_inertial_h_33": _Line("#0072B2", "--", label="visual-inertial, h = 33"),
     "visual_inertial_leaky": _Line("#CC79A7", label="visual-inertial, leaky"),
 }
 _MAPS: dict[str, _Line] = {
