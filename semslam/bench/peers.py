@@ -4,7 +4,7 @@ Reads   frames, motion    data_spec.md, tables 2 and 3
 Gives   stamps and poses  of the robot in the frame of the first keyframe; keyframes without a pose are left out
 
 None of them is a dependency: `pip install small_gicp kiss-icp pyorbslam3`. pyorbslam3 also needs ORB-SLAM3's
-vocabulary, whose file its environment variable `PYORBSLAM3_VOCAB` names.
+vocabulary, whose file its environment variable `PYORBSLAM3_VOCAB` names; `benchmarks/orb_vocabulary.py` makes one.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from semslam.tables.pictures import decode_colour, decode_depth
 from semslam.tables.spec import FRAMES, MOTION
 
 TASK = "semslam.bench.peers:track"
-VERSION = 2
+VERSION = 3
 TIMEOUT_S = 900.0
 _VOXEL_M, _REACH_M, _MAX_DEPTH_M, _NEIGHBOURS = 0.1, 0.3, 6.0, 20
 """Settings of small_gicp: of reaches of 0.2, 0.3 and 0.5 m and voxels of 0.05 and 0.1 m the best over three drives
@@ -136,22 +136,36 @@ def _kiss_icp(frames: Iterator[Keyframe], folder: Path) -> Poses:
 
 
 def _pyorbslam3(frames: Iterator[Keyframe], folder: Path) -> Poses:
-    """ORB-SLAM3 in its RGB-D mode, settings as ORB-SLAM3's own TUM example has them."""
+    """ORB-SLAM3 in its RGB-D mode, settings as ORB-SLAM3's own TUM example has them.
+
+    Once lost, ORB-SLAM3 throws a young map away and starts another at the identity, which nothing ties to the first
+    keyframe: from there on there is no pose.
+    """
     slam: Any = importlib.import_module("pyorbslam3")
-    try:
-        vocabulary = slam.vocabulary_path(download=False)
-    except FileNotFoundError as error:
-        raise SemslamError(
-            "pyorbslam3 has no vocabulary", hint="name ORBvoc.txt in the environment variable `PYORBSLAM3_VOCAB`"
-        ) from error
-    system, first = None, np.eye(4)
+    vocabulary, system, first = _orb_vocabulary(slam), None, np.eye(4)
+    lost = adrift = False
     for frame in frames:
         if system is None:
             settings = folder / "orb_slam3.yaml"
             settings.write_text(_orb_settings(frame))
             system, first = slam.Slam(vocabulary, settings, slam.Sensor.RGBD), frame.robot_from_camera
         found = system.track_rgbd(frame.rgb, frame.depth_m, frame.stamp_nanos * 1e-9)
-        yield first @ np.asarray(found.pose_wc) @ np.linalg.inv(frame.robot_from_camera) if found.pose_valid else None
+        pose = np.asarray(found.pose_wc, np.float64) if found.pose_valid else None
+        adrift |= lost and pose is not None and np.allclose(pose, np.eye(4), atol=1e-6)
+        lost = pose is None
+        yield None if pose is None or adrift else first @ pose @ np.linalg.inv(frame.robot_from_camera)
+
+
+def _orb_vocabulary(slam: Any) -> str:
+    """File of the vocabulary; never fetched from anywhere."""
+    try:
+        return str(slam.vocabulary_path(download=False))
+    except FileNotFoundError as error:
+        raise SemslamError(
+            "pyorbslam3 has no vocabulary",
+            hint="name ORBvoc.txt in the environment variable `PYORBSLAM3_VOCAB`, or a file that "
+            "`python benchmarks/orb_vocabulary.py RUN OUT.txt` makes from the pictures of a run",
+        ) from error
 
 
 _PEERS: dict[str, Callable[[Iterator[Keyframe], Path], Poses]] = {

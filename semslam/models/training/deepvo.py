@@ -21,7 +21,7 @@ from semslam.models.training.trainer import Progress, Schedule, fit
 DEEPVO = "deepvo.onnx"
 LENGTH = 8
 """Keyframes of a training sequence, seven pairs; any number at run time."""
-USUAL = Schedule(steps=2500, batch=12, peak_rate=1e-3, warm_up=100, average=0.995)
+USUAL = Schedule(steps=2000, batch=12, peak_rate=1e-3, warm_up=100, average=0.995)
 """Sequences a step."""
 
 

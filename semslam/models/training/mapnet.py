@@ -33,7 +33,7 @@ TRAINING_MAP_SIDE = 21
 weight depends on the size; the export has the whole map."""
 GIVEN_UNTIL = 0.4
 """Share of the steps in which keyframes are placed by their true poses."""
-USUAL = Schedule(steps=1200, batch=4, warm_up=50, average=0.99)
+USUAL = Schedule(steps=800, batch=4, warm_up=50, average=0.99)
 """Sequences a step."""
 
 
