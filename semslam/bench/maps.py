@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from semslam.errors import SemslamError
 from semslam.geometry.frames import SE2, wrap_angle
 from semslam.geometry.grid import Planes
+from semslam.labels import FIRST_OBJECT
 from semslam.map_metrics import Ids, Mask, class_overlaps, labels_of, map_mse, score_map
 from semslam.models.training.drives import Drive, DriveSet, RunTables
 from semslam.slam.paper import (
@@ -44,7 +45,7 @@ from semslam.stages.settings import PaperConfig
 
 CELL_SETS = ("reached", "visible", "all")
 TASK = "semslam.bench.maps:build"
-VERSION = 2
+VERSION = 3
 """Raise it whenever the same part would come out differently."""
 
 
@@ -102,7 +103,7 @@ def _one(
         for name, cells in _cell_sets(laid).items():
             curves[name].append(_number(map_mse(world.planes, laid.truth, cells)))
         if before is not None:
-            panels.append(_panel(step, before, laid, labels_of(world.planes), drive))
+            panels.append(_panel(step, before, laid, labels_of(world.planes), drive, paper.noise_floor))
     if laid is None:
         raise SemslamError(f"`{drive.name}` has no keyframe", hint="`semslam status OUT` shows what was read of it")
     scores = {name: asdict(score_map(world.planes, laid.truth, cells)) for name, cells in _cell_sets(laid).items()}
@@ -157,10 +158,10 @@ def _panel_steps(steps: int) -> tuple[int, ...]:
     return tuple(dict.fromkeys((min(4, steps - 1), steps // 2, steps - 1)))
 
 
-def _panel(step: int, before: Ids, laid: Laid, after: Ids, drive: Drive) -> dict[str, Any]:
+def _panel(step: int, before: Ids, laid: Laid, after: Ids, drive: Drive, beta: float) -> dict[str, Any]:
     """Label maps of one step for a picture, plain values."""
     observed = np.zeros_like(before)
-    observed[laid.window] = labels_of(laid.placed)
+    observed[laid.window] = _shown(laid.placed, beta)
     pictures = {"previous": before, "observation": observed, "updated": after, "truth": laid.truth}
     x, y, heading = drive.poses[step].tolist()
     return {
@@ -170,6 +171,12 @@ def _panel(step: int, before: Ids, laid: Laid, after: Ids, drive: Drive) -> dict
         "window": [[part.start, part.stop] for part in laid.window],
         **{name: ids.tolist() for name, ids in pictures.items()},
     }
+
+
+def _shown(placed: Planes, beta: float) -> Ids:
+    """(rows, columns) of the strongest object where there is any: its weights are shares and would lose to floor."""
+    objects = placed[FIRST_OBJECT:]
+    return np.where(objects.max(0) >= beta, objects.argmax(0) + FIRST_OBJECT, labels_of(placed))
 
 
 def _number(value: float) -> float | None:
