@@ -20,6 +20,11 @@ class SemslamError(Exception):
         self.hint = hint
         self.details = details
 
+    @property
+    def in_a_line(self) -> str:
+        """Message and hint together, for tables of what went wrong."""
+        return f"{self.message}; {self.hint}" if self.hint else self.message
+
     def __reduce__(self) -> tuple[object, ...]:
         """Keep hint and details when the error crosses a process boundary."""
         return (_rebuild, (type(self), self.message, self.hint, self.details))

@@ -286,11 +286,31 @@ def test_networks_are_trained_and_used(toy: Path) -> None:
     assert report.results.poses("visual_inertial", "cross", "ape_m").shape == (1, 2)
     assert report.results.map_curves("convlstm", "real").shape == (1, 2, 3)
     models = list((toy / "out" / "parts" / "networks").glob("*/map_update.onnx"))
-    assert len(models) == 4  # intra; cross of three qualities
+    assert len(models) == 5  # intra; cross of three qualities, and with the wide view
     stamps = [path.stat().st_mtime_ns for path in models]
     again = quick(toy, "visual_inertial", "maps")
     assert [path.stat().st_mtime_ns for path in models] == stamps
     assert again.results.tracks == report.results.tracks
+    before = models[0].read_bytes()
+    models[0].write_bytes(before[: len(before) // 2])  # a network that was lost is made again from its checkpoint
+    assert quick(toy, "visual_inertial", "maps").results.tracks == report.results.tracks
+    assert models[0].read_bytes() == before
+
+
+def test_a_run_to_build_on_must_be_there(toy: Path, tmp_path: Path) -> None:
+    """A mistyped folder is not made anew and observed all over again."""
+    request = BenchRequest(toy / "homes", tmp_path / "out", ("chance",), quick=True, run=tmp_path / "nowhere")
+    with pytest.raises(UsageError, match="nowhere"):
+        bench_paper(request, STAGES, Console(quiet=True))
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_results_hold_only_what_was_asked_for(toy: Path) -> None:
+    """Tables and figures of rows that an earlier command asked for do not stay behind."""
+    quick(toy, "chance", "maps")
+    assert "map_loss.svg" in results_of(toy)
+    quick(toy, "chance")
+    assert not [name for name in results_of(toy) if name.startswith(("map", "table4"))]
 
 
 def test_the_command_asks_for_a_data_set(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -119,12 +119,9 @@ def test_a_restored_estimator_goes_on_bit_for_bit(tmp_path: Path, cut: int) -> N
     np.testing.assert_array_equal(second.belief().planes, straight.belief().planes)
 
 
-def test_without_a_network_the_setting_is_named() -> None:
+def test_without_a_network_the_setting_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where none is shipped; the message says what to type."""
-    from semslam.models.builtin import shipped
-
-    if shipped("map_update"):
-        pytest.skip("this package has a map update of its own")
+    monkeypatch.setattr("semslam.models.builtin.FOLDER", tmp_path)
     with pytest.raises(SemslamError, match=r"`localize\.paper\.model` is empty") as caught:
         open_estimator("paper", LocalizeConfig(paper=PAPER), CLASSES, CELL_M, SIDE)
     assert "--set localize.paper.model=" in caught.value.hint
@@ -145,6 +142,9 @@ def test_a_network_for_other_classes_is_refused_with_both_lists(tmp_path: Path) 
         ({"side": 33}, ["trained with side 33", "`localize.paper.side` is 11", "set `localize.paper.side` to 33"]),
         ({"cell_m": 0.1}, ["trained with cell_m 0.1", "`localize.paper.cell_m` is 0.3"]),
         ({"kappa": None}, ["no map update", "lack 'kappa'"]),
+        ({"binary": "true"}, ["trained on binary observations", "makes them weighted", "paper.binary=true"]),
+        ({"cell_m": "nan"}, ["trained with cell_m nan"]),
+        ({"kappa": "inf"}, ["no map update", "kappa is inf"]),
         ({"kappa": "steep"}, ["no map update", "steep"]),
         ({"kappa": -1.0}, ["no map update", "kappa is -1"]),
         ({"classes": "chair"}, ["no map update", "cannot be read"]),

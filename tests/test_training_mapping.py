@@ -336,6 +336,24 @@ def test_a_killed_training_goes_on_to_the_same_bytes(
         train_mapper(drives, tmp_path / "cut", schedule=QUICK, options=MapperOptions(PAPER, kernel=1))
 
 
+def test_a_training_that_ends_in_no_numbers_writes_nothing(drives: DriveSet, tmp_path: Path) -> None:
+    """The last step may spoil the weights without a loss to tell it; no network comes of that, nor a checkpoint."""
+    wild = replace(QUICK, steps=1, peak_rate=1e39, warm_up=1)
+    with pytest.raises(SemslamError, match="weight") as caught:
+        train_mapper(drives, tmp_path / "wild", schedule=wild)
+    assert "--rate" in caught.value.hint
+    assert not list((tmp_path / "wild").glob("*.onnx"))
+    assert not (tmp_path / "wild" / "checkpoint.pt").exists()
+
+
+@pytest.mark.parametrize("rate", ["nan", "inf", "0", "2"])
+def test_a_rate_that_is_none_is_refused(rate: str, folder: Path, tmp_path: Path, capsys: Any) -> None:
+    """As wrong use, before anything is read."""
+    asked = ["train", "mapper", str(folder), "--out", str(tmp_path / "out"), "--quality", "ideal", "--rate", rate]
+    assert run_command(asked, None) == 2
+    assert "--rate" in capsys.readouterr().err
+
+
 def test_a_shortened_drive_is_the_drive_as_it_began(drives: DriveSet) -> None:
     """The same observations, motion and poses, and the same map as far as it was visible by then."""
     whole = drives.drives[0]

@@ -168,7 +168,7 @@ def _do(store: Store, part: Part) -> str:
         result = getattr(importlib.import_module(module), name)(dict(part.arguments), folder)
     except SemslamError as error:
         store.spent(part, time.monotonic() - started)
-        return error.message
+        return error.in_a_line
     except Exception as error:
         store.spent(part, time.monotonic() - started)
         (folder / _TRACEBACK).write_text(traceback.format_exc())

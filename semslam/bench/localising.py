@@ -74,7 +74,7 @@ def _estimator(
     try:
         runs = work.pipeline.run("localize", logs, settings_of(work, row, protocol, seed, networks))
     except SemslamError as error:
-        missing.append(NotRun(row.name, where(protocol, seed), error.message))
+        missing.append(NotRun(row.name, where(protocol, seed), error.in_a_line))
         work.console.say(f"localize {name}: not run, {error.message}")
         return
     if runs.failures:

@@ -43,7 +43,7 @@ def noise_tracks(work: Work, networks: Networks, missing: list[NotRun]) -> Itera
             try:
                 settings = settings_of(work, row, "cross", seed, networks)
             except SemslamError as error:
-                missing.append(NotRun(row.name, where("noise", seed), error.message))
+                missing.append(NotRun(row.name, where("noise", seed), error.in_a_line))
                 continue
             for level in NOISE_LEVELS:
                 parts[row.name, level, seed] = _part(work, row, level, seed, settings, networks)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,11 @@ class BenchReport:
     results: Results
     page: Path
 
+    @property
+    def empty(self) -> bool:
+        """Whether nothing that was asked for could be run."""
+        return not (self.results.tracks or self.results.maps or self.results.noise)
+
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         return {
@@ -66,12 +72,18 @@ def bench_paper(request: BenchRequest, stages: Sequence[Stage], console: Console
     request = _quick(request) if request.quick else request
     rows = chosen_rows(request.rows)
     _require_report()
+    _require_device(request.device)
     dataset = open_dataset(request.dataset)
     request = replace(request, steps=min(request.steps, dataset.longest))
     request.out.mkdir(parents=True, exist_ok=True)
-    base = {"config_file": request.config_file, "assignments": request.assignments, "workers": request.workers}
+    base: dict[str, Any] = {
+        "config_file": request.config_file,
+        "assignments": request.assignments,
+        "workers": request.workers,
+    }
+    base |= {"options": request.options, "make": request.run is None}
     folder = request.run or request.out / "pipeline"
-    with Pipeline.opened(folder, stages, dataset.root, options=request.options, **base) as pipeline:
+    with Pipeline.opened(folder, stages, dataset.root, **base) as pipeline:
         seen = _observed(pipeline, dataset, console)
         work = Work(request, dataset, pipeline, Store(request.out / "parts"), console, rows, seen)
         results = _measured(work)
@@ -87,6 +99,15 @@ def _quick(request: BenchRequest) -> BenchRequest:
 def _require_report() -> None:
     if not figures.available():
         raise SemslamError("Figures need matplotlib, which is not installed", hint="pip install 'semslam[report]'")
+
+
+def _require_device(device: str) -> None:
+    if device == "cpu" or find_spec("torch") is None:  # a bench without torch lists its networks as not run
+        return
+    import torch
+
+    if not torch.cuda.is_available():
+        raise SemslamError("This torch finds no GPU", hint="train with `--device cpu`")
 
 
 def _observed(pipeline: Pipeline, dataset: Dataset, console: Console) -> Runs:
@@ -137,6 +158,9 @@ def _conditions(work: Work) -> Conditions:
 def _written(results: Results, folder: Path, console: Console) -> BenchReport:
     """Tables, figures, and the page that holds them."""
     folder.mkdir(parents=True, exist_ok=True)
+    for path in folder.iterdir():  # of rows that were asked for before, perhaps with other settings
+        if path.suffix in (".csv", ".parquet", ".svg") or path.name == tables.TIMES:
+            path.unlink()
     tables.write_tables(results, folder)
     drawn = figures.write_figures(results, folder)
     page = folder / "README.md"

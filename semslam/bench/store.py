@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from semslam.pipeline.cache import key_of
+from semslam.pipeline.digest import sha256_file
 from semslam.pipeline.files import read_json, write_json
 
 _DIGITS = 20
@@ -58,9 +59,15 @@ class Store:
         return self.root / part.kind / part.key
 
     def result(self, part: Part) -> dict[str, Any] | None:
-        """Its result if it is finished."""
+        """Its result if it is finished, and the network that it names is there as it was."""
         found = read_json(self.folder(part) / "result.json")
-        return found if isinstance(found, dict) else None
+        return found if isinstance(found, dict) and self._whole(part, found) else None
+
+    def _whole(self, part: Part, result: Mapping[str, Any]) -> bool:
+        if "digest" not in result:
+            return True
+        path = self.folder(part) / str(result.get("model"))
+        return path.is_file() and sha256_file(path) == result["digest"]
 
     def seconds(self, part: Part) -> float | None:
         """How long it took, over all its beginnings; None if nobody knows."""

@@ -38,6 +38,7 @@ from semslam.bench.rows import (
 from semslam.bench.statistics import Interval, interval, paired
 from semslam.pipeline.files import write_text
 
+TIMES = "training_times.md"
 _NONE = "-"
 _PER_CENT = 100.0
 
@@ -410,7 +411,7 @@ def write_tables(results: Results, folder: Path) -> None:
     for sheet in sheets(results):
         _write_csv(folder / f"{sheet.name}.csv", sheet.head, sheet.rows)
     if results.trained:
-        write_text(folder / "training_times.md", timing_sheet(results).markdown())
+        write_text(folder / TIMES, timing_sheet(results).markdown())
     _write_scores(folder, "pose_scores", _pose_scores(results))
     _write_scores(folder, "noise_scores", _noise_scores(results))
     _write_scores(folder, "pose_steps", _pose_steps(results))

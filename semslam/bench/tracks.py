@@ -22,7 +22,7 @@ from semslam.pipeline.cache import Entry, table_files
 from semslam.pipeline.config import Config, load_config
 from semslam.pipeline.console import Console
 from semslam.pipeline.discover import Log
-from semslam.pipeline.folder import OutputFolder, create_folder
+from semslam.pipeline.folder import OutputFolder, create_folder, open_folder
 from semslam.pipeline.run import run_logs
 from semslam.stages.contract import Stage
 from semslam.stages.settings import PaperConfig
@@ -44,10 +44,14 @@ class Pipeline:
 
     @staticmethod
     @contextmanager
-    def opened(root: Path, stages: Sequence[Stage], dataset: Path, **base: Any) -> Iterator[Pipeline]:
-        """The pipeline in the output folder `root`, which it holds until the block ends."""
-        folder = create_folder(root)
-        paths = sorted((dataset / "logs").glob("*.mcap"))
+    def opened(root: Path, stages: Sequence[Stage], dataset: Path, *, make: bool, **base: Any) -> Iterator[Pipeline]:
+        """The pipeline in the output folder `root`, which it holds until the block ends.
+
+        Raises:
+            UsageError: `root` is no output folder, and may not be made one.
+        """
+        folder = create_folder(root) if make else open_folder(root)
+        paths = sorted((dataset / "logs").resolve().glob("*.mcap"))
         with folder.locked():
             yield Pipeline(folder, tuple(stages), {path.stem: Log(path.stem, (path,)) for path in paths}, **base)
 
@@ -129,6 +133,8 @@ class TrackScore:
 def true_track(dataset: Path, log: str, steps: int) -> Track:
     """The exact track of the first keyframes of a log."""
     rows = TableFiles(TRUTH, [dataset / "truth" / log / "truth.parquet"]).read()
+    if not rows["frame"]:
+        raise SemslamError(f"The truth of `{log}` is empty", hint=f"simulate it again: `semslam simulate {dataset}`")
     columns = [rows[name][:steps] for name in ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")]
     return Track.of(*columns)
 

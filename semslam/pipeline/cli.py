@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import signal
 import sys
@@ -29,6 +30,18 @@ if TYPE_CHECKING:
 INTERRUPTED = 130
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 _SEED = click.IntRange(0, 2**31 - 1)
+
+
+class _Rate(click.FloatRange):
+    """A range that NaN is not in."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        found = super().convert(value, param, ctx)
+        if math.isnan(found):
+            self.fail(f"{value} is no number.", param, ctx)
+        return found
+
+
 _MODEL_OPTIONS = ("detector", "classes", "segmenter_encoder", "segmenter_decoder")
 
 
@@ -608,7 +621,7 @@ def _schedule_options(unit: str, threads: int) -> tuple[Callable[..., Any], ...]
     return (
         click.option("--steps", type=click.IntRange(1), help="Default: as the shipped model."),
         click.option("--batch", type=click.IntRange(1), help=f"{unit} a step. Default: as the shipped model."),
-        click.option("--rate", type=click.FloatRange(0, min_open=True), help="Peak learning rate. Default: likewise."),
+        click.option("--rate", type=_Rate(0, 1, min_open=True), help="Peak learning rate. Default: likewise."),
         click.option("--seed", type=_SEED, default=1, show_default=True, help="Of everything random."),
         click.option("--threads", type=click.IntRange(1, 64), default=threads, show_default=True, help="Of torch."),
         click.option("--device", type=click.Choice(("auto", "cpu", "cuda")), default="auto", show_default=True),
@@ -800,7 +813,7 @@ def bench() -> None:
 @click.pass_context
 def bench_paper_command(
     context: click.Context, /, dataset: Path | None, out: Path, as_json: bool, quiet: bool, **given: Any
-) -> None:
+) -> int:
     """Regenerate the paper's tables and figures on DATASET, beside its own figures.
 
     DATASET is a folder of `semslam simulate`; --quick makes a tiny one if none is named. OUT/results/README.md holds
@@ -822,6 +835,7 @@ def bench_paper_command(
     report = bench_paper(request, _stages(context), console)
     if as_json:
         _print_json(report.as_json())
+    return 1 if report.empty else 0
 
 
 def _tiny_homes(folder: Path, workers: int | None, console: Console) -> Path:

@@ -42,6 +42,8 @@ class ModelCard:
     """Cells along a side of the observation. h."""
     kernel: int
     """Cells along a side of the convolutions: 3, or 1 for an LSTM a cell."""
+    binary: bool | None
+    """Whether its observations were binary; None where the file does not say."""
     initial_hidden: NDArray[np.float32]
     """(L,) raw state of cells that nothing updated yet; where the file leaves it out, one-hot *unobserved*."""
     initial_cell: NDArray[np.float32]
@@ -62,6 +64,7 @@ class ModelCard:
                 cell_m=float(metadata["cell_m"]),
                 side=int(metadata["side"]),
                 kernel=int(metadata["kernel"]),
+                binary=metadata["binary"] == "true" if "binary" in metadata else None,
                 initial_hidden=_initial(metadata, "initial_hidden", np.eye(len(classes))[UNOBSERVED]),
                 initial_cell=_initial(metadata, "initial_cell", np.zeros(len(classes))),
             )
@@ -69,7 +72,7 @@ class ModelCard:
             raise _no_map_update(path, f"its metadata lack {error.args[0]!r}") from error
         except (ValueError, TypeError, IndexError) as error:
             raise _no_map_update(path, f"its metadata cannot be read: {error}") from error
-        if not (card.kappa > 0 and card.kernel % 2 == 1 and card.kernel > 0):
+        if not (0 < card.kappa < np.inf and card.kernel % 2 == 1 and card.kernel > 0):
             raise _no_map_update(path, f"its kappa is {card.kappa:g} and its kernel {card.kernel}")
         return card
 
@@ -93,7 +96,9 @@ class LearnedMap:
         self._planes = self._read(self._hidden)
 
     @staticmethod
-    def open(model: Path, classes: Sequence[str], map_side: int, cell_m: float, side: int) -> LearnedMap:
+    def open(
+        model: Path, classes: Sequence[str], map_side: int, cell_m: float, side: int, *, binary: bool = False
+    ) -> LearnedMap:
         """An empty map of `map_side` cells of `cell_m` metres, for observations of `side` cells with that class list.
 
         Raises:
@@ -103,6 +108,13 @@ class LearnedMap:
         _check_signature(session)
         card = ModelCard.read(model, session.signature.metadata)
         _check_fits(model, card, tuple(classes), cell_m, side)
+        if card.binary not in (None, binary):
+            kinds = {True: "binary", False: "weighted"}
+            raise SemslamError(
+                f"Map update `{model}` was trained on {kinds[not binary]} observations, but "
+                f"`localize.paper.binary` makes them {kinds[binary]}",
+                hint=f"`--set localize.paper.binary={str(not binary).lower()}`, or train another one",
+            )
         return LearnedMap(session, card, map_side)
 
     @property
@@ -158,7 +170,7 @@ def _check_fits(model: Path, card: ModelCard, classes: tuple[str, ...], cell_m: 
             hint="train one on these observations (`semslam train mapper`), or `--set localize.paper.update=leaky`",
         )
     for key, trained, given in (("cell_m", card.cell_m, cell_m), ("side", card.side, side)):
-        if abs(trained - given) > 1e-6 * given:
+        if not abs(trained - given) <= 1e-6 * given:
             raise SemslamError(
                 f"Map update `{model}` was trained with {key} {trained:g}, but `localize.paper.{key}` is {given:g}",
                 hint=f"set `localize.paper.{key}` to {trained:g}, or train one for {given:g}",

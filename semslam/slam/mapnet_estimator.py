@@ -121,7 +121,8 @@ def _grids(session: Session) -> tuple[int, PoseGrid]:
         grid, side = PoseGrid(0, 0, 0.0), 0
     expected = {"picture": (1, 3, HEIGHT, WIDTH), "cells": (1, PARTS), "given": (grid.headings, grid.side, grid.side)}
     fits = set(shapes) == set(_INPUTS) and all(shapes[name] == shape for name, shape in expected.items())
-    if facts.get("task") != "mapnet" or not side or not fits:
+    sane = side > 0 and side % 2 == 1 and 0 < grid.cell_m < math.inf
+    if facts.get("task") != "mapnet" or not sane or not fits:
         raise SemslamError(
             f"`{session.path}` is no MapNet of semslam",
             details=signature.text(),

@@ -231,7 +231,7 @@ def open_map(config: PaperConfig, classes: tuple[str, ...], model: Path | None) 
         return LeakyMap(len(classes), config.map_side, config.leak)
     from semslam.slam.learned_map import LearnedMap  # with ONNX Runtime, which dead reckoning does without
 
-    return LearnedMap.open(model, classes, config.map_side, config.cell_m, config.side)
+    return LearnedMap.open(model, classes, config.map_side, config.cell_m, config.side, binary=config.binary)
 
 
 def pooling_factor(config: PaperConfig, cell_m: float, side: int) -> int:

@@ -225,6 +225,9 @@ class _State:
         return int(stored["step"])
 
     def save(self, path: Path, run: Mapping[str, Any], step: int) -> None:
+        for name, weights in self.network.state_dict().items():
+            if not bool(torch.isfinite(weights).all()):
+                raise _diverged(f"weight `{name}` after step {step}", math.nan)
         temporary = path.with_name(f".{path.name}.partial-{os.getpid()}")
         content = {
             "run": dict(run),
@@ -253,7 +256,8 @@ class _Curves:
     def __init__(self, path: Path, first: int) -> None:
         self._path = path
         rows = list(csv.reader(path.read_text().splitlines())) if path.is_file() and first else []
-        self._rows = [row for row in rows if row[:1] == ["step"] or (row and int(row[0]) <= first)]
+        done = {str(step) for step in range(first + 1)} | {"step"}
+        self._rows = [row for row in rows if row and row[0] in done]
 
     def add(self, step: int, rate: float, losses: Mapping[str, float]) -> None:
         if not self._rows:
