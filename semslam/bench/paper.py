@@ -104,10 +104,9 @@ def _require_report() -> None:
 def _require_device(device: str) -> None:
     if device == "cpu" or find_spec("torch") is None:  # a bench without torch lists its networks as not run
         return
-    import torch
+    from semslam.models.training.runs import device_of
 
-    if not torch.cuda.is_available():
-        raise SemslamError("This torch finds no GPU", hint="train with `--device cpu`")
+    device_of(device)
 
 
 def _observed(pipeline: Pipeline, dataset: Dataset, console: Console) -> Runs:

@@ -44,7 +44,9 @@ class Pipeline:
 
     @staticmethod
     @contextmanager
-    def opened(root: Path, stages: Sequence[Stage], dataset: Path, *, make: bool, **base: Any) -> Iterator[Pipeline]:
+    def opened(
+        root: Path, stages: Sequence[Stage], dataset: Path, *, make: bool = True, **base: Any
+    ) -> Iterator[Pipeline]:
         """The pipeline in the output folder `root`, which it holds until the block ends.
 
         Raises:

@@ -488,7 +488,16 @@ def prepare(run: Run) -> torch.device:
     torch.set_num_threads(run.threads)
     torch.use_deterministic_algorithms(True, warn_only=True)
     torch.utils.deterministic.fill_uninitialized_memory = False  # nobody reads it; filling it takes time
-    name = run.device if run.device != "auto" else ("cuda" if torch.cuda.is_available() else "cpu")
+    return device_of(run.device)
+
+
+def device_of(asked: str) -> torch.device:
+    """The device of a name: cpu, cuda, or auto.
+
+    Raises:
+        SemslamError: there is no such device.
+    """
+    name = asked if asked != "auto" else ("cuda" if torch.cuda.is_available() else "cpu")
     if name == "cuda" and not torch.cuda.is_available():
         raise SemslamError("This torch finds no GPU", hint="train with `--device cpu`")
     return torch.device(name)
