@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from semslam.bench.rows import FAR, FAR_SIDE
+
 
 @dataclass(frozen=True)
 class PosePrint:
@@ -32,7 +34,7 @@ POSES: dict[tuple[str, str], PosePrint] = {
     ("visual_inertial", "cross"): PosePrint(2.39, 57.11),
     ("semantic_cell", "cross"): PosePrint(3.80, 80.50),
 }
-POSES |= {(f"{row}_h_33", protocol): one for (row, protocol), one in POSES.items() if row.startswith("visual")}
+POSES |= {(f"{row}_h_{FAR_SIDE}", protocol): one for (row, protocol), one in POSES.items() if row.startswith("visual")}
 """By row and protocol. The text says h = 11, the authors' code 33: which of them was printed is not known."""
 
 UNPRINTED = {"orb_rgbd": "N/A"}
@@ -55,5 +57,5 @@ MAPS: dict[tuple[str, str], MapPrint] = {
     ("leaky_1.0", "obstructed"): MapPrint(4.35, 0.41),
     ("leaky_1.0", "ideal"): MapPrint(6.65, 0.59),
 }
-MAPS |= {(method, "real_h_33"): one for (method, quality), one in MAPS.items() if quality == "real"}
+MAPS |= {(method, FAR): one for (method, quality), one in MAPS.items() if quality == "real"}
 """By method and what the maps were built from; likewise."""
