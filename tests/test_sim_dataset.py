@@ -342,7 +342,8 @@ def test_interrupted(tmp_path: Path) -> None:
     finished = whole_logs(out)
     assert not list(out.rglob(".*partial*"))
     plan = json.loads((out / "plan.json").read_text())
-    assert 2 <= sum(one["sha256"] is not None for one in plan["logs"]) <= finished
+    receipts = len(list(out.glob("receipts/*.json")))
+    assert 2 <= sum(one["sha256"] is not None for one in plan["logs"]) == receipts <= finished
     again = start(out, *OPTIONS, "--workers", 2, "--json")
     told = json.loads(again.communicate()[0])
     assert told["cached"] >= 2

@@ -283,7 +283,9 @@ class _Making:
         write_splits(self.folder.splits, assign(self.recordings, self.recipe.seed), self.recipe.seed)
 
     def _write_plan(self) -> None:
-        receipts = {name: one.receipt for name, one in self.results.items() if one.receipt}
+        """By the receipts there are: an interrupted command has not heard of every log its workers finished."""
+        finished = {one.name: self.folder.finished(one) for one in self.recordings}
+        receipts = {name: receipt for name, receipt in finished.items() if receipt}
         self.folder.write_plan(self.recipe, self.recordings, receipts)
 
 
