@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -15,14 +17,16 @@ import pytest
 pytest.importorskip("matplotlib", reason="the figures need the extra [report]")
 
 from semslam.bench import figures, peers, tables
+from semslam.bench.dataset import open_dataset
 from semslam.bench.jobs import run_parts
 from semslam.bench.paper import BenchReport, bench_paper
 from semslam.bench.rows import ALL, chosen_rows
 from semslam.bench.store import Store
 from semslam.bench.work import BenchRequest
-from semslam.errors import UsageError
+from semslam.errors import SemslamError, UsageError
 from semslam.pipeline.cli import run_command
 from semslam.pipeline.console import Console
+from semslam.pipeline.folder import OutputFolder
 from semslam.stages.catalogue import STAGES
 from tests.bench_parts import part
 from tests.bench_world import made_up_results, make_dataset
@@ -303,6 +307,48 @@ def test_a_run_to_build_on_must_be_there(toy: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="nowhere"):
         bench_paper(request, STAGES, Console(quiet=True))
     assert not (tmp_path / "nowhere").exists()
+
+
+def test_a_map_update_is_chosen_by_the_rows_alone(toy: Path, tmp_path: Path) -> None:
+    """One that is asked for is refused, not silently left aside."""
+    for setting in ("update=learned", "model=mine.onnx"):
+        asked = {"assignments": (f"localize.paper.{setting}",), "run": toy / "out" / "pipeline"}
+        request = BenchRequest(toy / "homes", tmp_path / "out", ("chance",), **asked)  # type: ignore[arg-type]
+        with pytest.raises(UsageError, match="chosen by the rows") as caught:
+            bench_paper(request, STAGES, Console(quiet=True))
+        assert "--rows" in caught.value.hint
+
+
+def test_one_bench_at_a_time(toy: Path, tmp_path: Path) -> None:
+    """A second one in the same folder is told who is there."""
+    (tmp_path / "out").mkdir()
+    request = BenchRequest(toy / "homes", tmp_path / "out", ("chance",), run=toy / "out" / "pipeline")
+    with (
+        OutputFolder(tmp_path / "out").locked(),
+        pytest.raises(SemslamError, match=f"is in use by process {os.getpid()}"),
+    ):
+        bench_paper(request, STAGES, Console(quiet=True))
+
+
+def test_a_damaged_data_set_is_made_again_by_simulate(toy: Path, tmp_path: Path) -> None:
+    """The hint names the command that makes its files, not a run's."""
+    homes = tmp_path / "homes"
+    shutil.copytree(toy / "homes", homes)
+    for damaged in (next(homes.glob("truth/*/truth.parquet")), homes / "splits.parquet"):
+        damaged.write_bytes(damaged.read_bytes()[:100])
+        with pytest.raises(SemslamError, match=f"`{damaged}` is damaged") as caught:
+            open_dataset(homes).longest  # noqa: B018
+        assert caught.value.hint == f"make it again: `semslam simulate {homes} --verify`"
+
+
+@pytest.mark.skipif(find_spec("torch") is None, reason="needs torch: pip install 'semslam[train]'")
+def test_a_gpu_that_is_not_there_is_refused(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before anything is read."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    request = BenchRequest(toy / "homes", tmp_path / "out", ("deepvo",), device="cuda")
+    with pytest.raises(SemslamError, match="finds no GPU"):
+        bench_paper(request, STAGES, Console(quiet=True))
+    assert not (tmp_path / "out").exists()
 
 
 def test_results_hold_only_what_was_asked_for(toy: Path) -> None:

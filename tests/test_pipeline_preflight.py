@@ -55,6 +55,12 @@ GOOD = ["--detector", "detector.onnx", "--classes", "classes.txt"]
         ([*GOOD, "--set", "localize.paper.map_side=32"], "`localize.paper.map_side` is 32", "33"),
         ([*GOOD, "--set", "localize.paper.side=10"], "`localize.paper.side` is 10", "11"),
         ([*GOOD, "--set", "localize.paper.cell_m=0.2"], "no odd multiple of `extract.cell_m`", "0.3"),
+        ([*GOOD, "--set", "localize.paper.update=learned"], "classes", "localize.paper"),
+        (
+            [*GOOD, "--estimator", "deepvo", "--set", "localize.deepvo.model=broken.onnx"],
+            "is no ONNX file, or is damaged",
+            "again",
+        ),
         ([*GOOD, "--set", "export.free_threshold=0.9"], "leaves nothing between them", "0.196"),
         ([*GOOD, "--topic", "color=/camera"], "unknown role `color`", "did you mean `colour`?"),
         ([*GOOD, "--set", "extract.min_depth_m=7"], "leaves no depth between them", "max_depth_m"),

@@ -15,11 +15,11 @@ from typing import Any
 
 from semslam.bench.rows import PROTOCOLS
 from semslam.errors import SemslamError
-from semslam.models.training.drives import logs_of
+from semslam.models.training.drives import logs_of, simulating
 from semslam.pipeline.cache import key_of
 from semslam.pipeline.digest import sha256_file
 from semslam.pipeline.files import read_json
-from semslam.tables.parquet import TableFiles
+from semslam.tables.parquet import TableError, TableFiles, made_by
 from semslam.tables.spec import SPLITS, TRUTH
 
 
@@ -48,7 +48,8 @@ class Dataset:
     def longest(self) -> int:
         """Keyframes of the longest log that tests."""
         logs = {log for logs in self.test.values() for log in logs}
-        return max(TableFiles(TRUTH, [self.root / "truth" / log / "truth.parquet"]).rows for log in logs)
+        with made_by(simulating(self.root)):
+            return max(TableFiles(TRUTH, [self.root / "truth" / log / "truth.parquet"]).rows for log in logs)
 
     def truth_digest(self, logs: Sequence[str]) -> str:
         """Of the truth of some logs."""
@@ -67,6 +68,8 @@ def open_dataset(root: Path) -> Dataset:
     for protocol in PROTOCOLS:
         try:
             train[protocol], test[protocol] = (logs_of(root, protocol, part) for part in ("train", "test"))
+        except TableError:
+            raise
         except SemslamError as error:
             problem = error
     if problem and not test:

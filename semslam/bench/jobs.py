@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from semslam.bench.store import Part, Store
 from semslam.errors import SemslamError
+from semslam.pipeline.files import write_text
 from semslam.pipeline.threads import ONE_THREAD
 from semslam.processes import die_with_parent
 
@@ -171,7 +172,7 @@ def _do(store: Store, part: Part) -> str:
         return error.in_a_line
     except Exception as error:
         store.spent(part, time.monotonic() - started)
-        (folder / _TRACEBACK).write_text(traceback.format_exc())
+        write_text(folder / _TRACEBACK, traceback.format_exc())
         return f"{type(error).__name__}: {error} (`{folder / _TRACEBACK}`)"
     (folder / _TRACEBACK).unlink(missing_ok=True)
     store.finish(part, result, time.monotonic() - started)

@@ -25,10 +25,11 @@ from semslam.errors import SemslamError
 from semslam.geometry.frames import SE2, wrap_angle
 from semslam.geometry.grid import Planes, to_dense
 from semslam.labels import UNOBSERVED
+from semslam.models.training.drives import simulating
 from semslam.slam.estimator import Step
 from semslam.slam.registry import open_estimator
 from semslam.stages.settings import LocalizeConfig, PaperConfig
-from semslam.tables.parquet import TableFiles
+from semslam.tables.parquet import TableFiles, made_by
 from semslam.tables.spec import MOTION, OBSERVATIONS, TRUTH
 
 TASK = "semslam.bench.noise:track"
@@ -117,7 +118,8 @@ def _observed(table: TableFiles, shape: tuple[int, int, int]) -> Iterator[tuple[
 
 def _motions(motion: list[Path], truth: Path, level: float) -> Iterator[tuple[int, SE2 | None]]:
     """Stamps of all keyframes and the motion to each, with its error multiplied."""
-    rows = TableFiles(TRUTH, [truth]).read(["stamp_nanos", "x_m", "y_m", "heading_rad"])
+    with made_by(simulating(truth.parents[2])):
+        rows = TableFiles(TRUTH, [truth]).read(["stamp_nanos", "x_m", "y_m", "heading_rad"])
     poses = {stamp: SE2(*pose) for stamp, *pose in zip(*rows.values(), strict=True)}
     before: SE2 | None = None
     moved = TableFiles(MOTION, motion).read(["stamp_nanos", "dx_m", "dy_m", "dheading_rad"])

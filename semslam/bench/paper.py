@@ -31,10 +31,12 @@ from semslam.bench.rows import chosen_rows
 from semslam.bench.store import Store
 from semslam.bench.tracks import Pipeline, Runs
 from semslam.bench.work import BenchRequest, Work
-from semslam.errors import SemslamError
+from semslam.errors import SemslamError, UsageError
 from semslam.pipeline.console import Console
 from semslam.pipeline.files import write_text
+from semslam.pipeline.folder import OutputFolder
 from semslam.stages.contract import Stage
+from semslam.stages.settings import PaperConfig
 
 _QUICK_HEADINGS = 24
 
@@ -67,7 +69,8 @@ def bench_paper(request: BenchRequest, stages: Sequence[Stage], console: Console
     """Regenerate every table and figure.
 
     Raises:
-        SemslamError: no data set, an unknown row, a refused configuration, or matplotlib is missing.
+        SemslamError: no data set, an unknown row, a refused configuration, another bench works in `out`, or matplotlib
+            is missing.
     """
     request = _quick(request) if request.quick else request
     rows = chosen_rows(request.rows)
@@ -83,7 +86,9 @@ def bench_paper(request: BenchRequest, stages: Sequence[Stage], console: Console
     }
     base |= {"options": request.options, "make": request.run is None}
     folder = request.run or request.out / "pipeline"
-    with Pipeline.opened(folder, stages, dataset.root, **base) as pipeline:
+    opened = Pipeline.opened(folder, stages, dataset.root, **base)
+    with OutputFolder(request.out).locked(), opened as pipeline:
+        _require_free_rows(pipeline)
         seen = _observed(pipeline, dataset, console)
         work = Work(request, dataset, pipeline, Store(request.out / "parts"), console, rows, seen)
         results = _measured(work)
@@ -107,6 +112,17 @@ def _require_device(device: str) -> None:
     from semslam.models.training.runs import device_of
 
     device_of(device)
+
+
+def _require_free_rows(pipeline: Pipeline) -> None:
+    """Every row has a map update of its own; one that was asked for would be silently left aside."""
+    paper, usual = pipeline.paper(), PaperConfig()
+    for name in ("update", "model"):
+        if getattr(paper, name) != getattr(usual, name):
+            raise UsageError(
+                f"`localize.paper.{name}` is chosen by the rows of the bench",
+                hint="leave it out of `--set` and of the configuration; `--rows visual_leaky`, say, chooses a row",
+            )
 
 
 def _observed(pipeline: Pipeline, dataset: Dataset, console: Console) -> Runs:

@@ -18,6 +18,7 @@ import numpy as np
 from semslam.bench.rows import CHANCE, STANDSTILL, Row
 from semslam.errors import SemslamError
 from semslam.metrics import Errors, Track, chance_errors, errors
+from semslam.models.training.drives import simulating
 from semslam.pipeline.cache import Entry, table_files
 from semslam.pipeline.config import Config, load_config
 from semslam.pipeline.console import Console
@@ -26,7 +27,7 @@ from semslam.pipeline.folder import OutputFolder, create_folder, open_folder
 from semslam.pipeline.run import run_logs
 from semslam.stages.contract import Stage
 from semslam.stages.settings import PaperConfig
-from semslam.tables.parquet import TableFiles
+from semslam.tables.parquet import TableFiles, made_by
 from semslam.tables.spec import POSES, TRUTH, Table
 
 
@@ -134,7 +135,8 @@ class TrackScore:
 
 def true_track(dataset: Path, log: str, steps: int) -> Track:
     """The exact track of the first keyframes of a log."""
-    rows = TableFiles(TRUTH, [dataset / "truth" / log / "truth.parquet"]).read()
+    with made_by(simulating(dataset)):
+        rows = TableFiles(TRUTH, [dataset / "truth" / log / "truth.parquet"]).read()
     if not rows["frame"]:
         raise SemslamError(f"The truth of `{log}` is empty", hint=f"simulate it again: `semslam simulate {dataset}`")
     columns = [rows[name][:steps] for name in ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")]

@@ -76,24 +76,30 @@ def _check_ingest(config: Config) -> None:
 
 
 def _check_extract(config: Config) -> None:
-    """Open the networks and choose the classes."""
+    _classes(config)
+
+
+def _classes(config: Config) -> tuple[str, ...]:
+    """Open the networks of extract and choose the classes."""
     from semslam.stages.extract import ObjectClasses, open_models
 
     section = config.of(EXTRACT)
     detector, _ = open_models(section, 1)
-    ObjectClasses.choose(detector.class_names, section)
+    return ObjectClasses.choose(detector.class_names, section).all
 
 
 def _check_localize(config: Config) -> None:
-    """Whether the paper's cells can be made from those of extract, and the networks of all estimators are there."""
+    """Whether the paper's cells can be made from those of extract, and all estimators take their networks."""
     from semslam.slam.paper_estimator import pooling_factor
-    from semslam.slam.registry import model_of
+    from semslam.slam.registry import model_of, open_estimator
 
     section, extract = config.of(LOCALIZE), config.of(EXTRACT)
-    for name in section.estimators:
-        model_of(name, section)
     if any(name.startswith("paper") for name in section.estimators):
         pooling_factor(section.paper, extract.cell_m, extract.side)
+    for name in section.estimators:
+        if model_of(name, section):
+            classes = _classes(config) if name.startswith("paper") else ()
+            open_estimator(name, section, classes, extract.cell_m, extract.side)
 
 
 def _check_export(config: Config) -> None:

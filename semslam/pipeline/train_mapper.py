@@ -8,7 +8,7 @@ from pathlib import Path
 
 from semslam.models.training.drives import DriveSet, RunTables, logs_of
 from semslam.models.training.mapping import USUAL, MapperOptions
-from semslam.models.training.runs import Run, train_map_update
+from semslam.models.training.runs import Run, require_place, train_map_update
 from semslam.models.training.trainer import Schedule
 from semslam.pipeline.console import Console
 from semslam.pipeline.run_tables import run_tables
@@ -54,6 +54,7 @@ def train_on_drives(console: Console, request: MapperRequest) -> list[Path]:
     Raises:
         SemslamError: data set, run and options do not fit together, or the folder holds another training.
     """
+    require_place(request.out, request.device)
     tables = _tables(request.run_folder) if request.run_folder else None
     drives, unseen = (_drives(console, request, part, tables) for part in ("train", "test"))
     view = TrainingView(console)

@@ -19,7 +19,7 @@ from pathlib import Path
 from semslam.errors import SemslamError
 from semslam.metrics import Score, Track, chance, score, standstill
 from semslam.models.training.drives import PARTS, logs_of
-from semslam.models.training.runs import SEQUENCES, Run, train_on_pictures
+from semslam.models.training.runs import SEQUENCES, Run, require_place, train_on_pictures
 from semslam.models.training.scores import mean
 from semslam.models.training.sequences import DriveFiles, drive_files
 from semslam.pipeline.console import Console
@@ -61,6 +61,7 @@ def train_sequences(console: Console, task: str, request: DrivesRequest) -> list
     Raises:
         SemslamError: data set and run do not fit together, or the folder holds another training.
     """
+    require_place(request.out, request.device)
     files, unseen = drives_of(request)
     schedule = request.schedule_from(SEQUENCES[task].defaults)
     command = request.typed(task, schedule, f"--protocol {request.protocol}")

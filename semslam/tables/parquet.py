@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,15 @@ _ROW_GROUP_BYTES = 8 << 20
 
 class TableError(SemslamError):
     """A table file is missing, damaged, or of another specification."""
+
+
+@contextmanager
+def made_by(command: str) -> Iterator[None]:
+    """Errors of table files within hint at the command that makes those files, not at a run of the stages."""
+    try:
+        yield
+    except TableError as error:
+        raise TableError(error.message, hint=f"make it again: `{command}`", details=error.details) from error
 
 
 def arrow_schema(table: Table, meta: Mapping[str, Any] | None = None) -> pa.Schema:

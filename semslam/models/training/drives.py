@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +25,7 @@ from semslam.geometry.frames import SE2
 from semslam.geometry.grid import Planes, object_planes, pool_observation, to_dense, to_sparse
 from semslam.labels import UNOBSERVED
 from semslam.stages.settings import PaperConfig
-from semslam.tables.parquet import TableFiles
+from semslam.tables.parquet import TableFiles, made_by
 from semslam.tables.spec import MOTION, OBSERVATIONS, SPLITS, TRUTH
 from semslam.tables.true_map import TrueMap, read_true_map
 
@@ -211,7 +212,8 @@ def logs_of(dataset: Path, protocol: str, part: str) -> tuple[str, ...]:
         raise SemslamError(
             f"`{dataset}` is no data set: it has no `splits.parquet`", hint=f"make one: `semslam simulate {dataset}`"
         )
-    rows = TableFiles(SPLITS, [path]).read(["log", protocol])
+    with made_by(simulating(dataset)):
+        rows = TableFiles(SPLITS, [path]).read(["log", protocol])
     names = tuple(log for log, side in zip(rows["log"], rows[protocol], strict=True) if side == part)
     if not names:
         more = "--scenes" if protocol == "cross" else "--trajectories"
@@ -220,6 +222,11 @@ def logs_of(dataset: Path, protocol: str, part: str) -> tuple[str, ...]:
             hint=f"make a larger data set: `semslam simulate {dataset} {more} 3`",
         )
     return names
+
+
+def simulating(dataset: Path) -> str:
+    """What makes damaged files of a data set again."""
+    return f"semslam simulate {dataset} --verify"
 
 
 def _tables(run: Mapping[str, RunTables] | None, log: str, quality: str) -> RunTables | None:
@@ -240,12 +247,15 @@ def _drive(
     folder = dataset / "truth" / log
     if not folder.is_dir():
         raise SemslamError(f"`{dataset}` has no log `{log}`", hint=f"`ls {dataset}/truth` lists them")
-    stamps, poses = _true_poses(TableFiles(TRUTH, [folder / "truth.parquet"]))
+    with made_by(simulating(dataset)):
+        stamps, poses = _true_poses(TableFiles(TRUTH, [folder / "truth.parquet"]))
     keyframes, motion = (stamps, np.full((len(stamps), 3), np.nan)) if tables is None else _motion(tables.motion)
     pairs = _pairs(keyframes, stamps, log)
     paths = tables.observations if tables and quality == REAL else (folder / f"{quality}.parquet",)
-    sights, classes = _sights(TableFiles(OBSERVATIONS, paths), keyframes, config)
-    truth = read_true_map(folder / "true_map.parquet", config.cell_m)
+    with nullcontext() if quality == REAL else made_by(simulating(dataset)):
+        sights, classes = _sights(TableFiles(OBSERVATIONS, paths), keyframes, config)
+    with made_by(simulating(dataset)):
+        truth = read_true_map(folder / "true_map.parquet", config.cell_m)
     labels, first_seen = _wanted(truth, classes, pairs, log)
     return Drive(log, sights, motion, poses[pairs], labels, first_seen), classes
 

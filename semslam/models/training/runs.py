@@ -117,7 +117,7 @@ def _alone(folder: Path) -> Iterator[None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except FileExistsError as error:
-        raise SemslamError(f"`{folder}` is a file", hint="give another `--out`") from error
+        raise _not_a_folder(folder) from error
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         _lock(descriptor, folder)
@@ -491,6 +491,21 @@ def prepare(run: Run) -> torch.device:
     return device_of(run.device)
 
 
+def require_place(out: Path, device: str) -> None:
+    """Refuse what could never be trained before data are read, which may take minutes.
+
+    Raises:
+        SemslamError: there is no such device, or `out` is a file.
+    """
+    device_of(device)
+    if out.exists() and not out.is_dir():
+        raise _not_a_folder(out)
+
+
+def _not_a_folder(out: Path) -> SemslamError:
+    return SemslamError(f"`{out}` is a file", hint="give another `--out`")
+
+
 def device_of(asked: str) -> torch.device:
     """The device of a name: cpu, cuda, or auto.
 
@@ -574,7 +589,10 @@ def write_card(path: Path, title: str, text: str, facts: Mapping[str, Any], more
     stamp = {"torch": torch.__version__, "date": datetime.date.today()}
     rows = "\n".join(f"| {name} | {value} |" for name, value in {**own, **facts, **stamp}.items())
     body = "\n\n".join([f"# {title}", text, f"| | |\n|---|---|\n{rows}", *more])
-    path.with_suffix(".md").write_text(body + "\n", encoding="utf-8")
+    card = path.with_suffix(".md")
+    unfinished = card.with_name(f".tmp-{card.name}")
+    unfinished.write_text(body + "\n", encoding="utf-8")
+    unfinished.replace(card)
 
 
 TASKS: Mapping[str, Task] = {
