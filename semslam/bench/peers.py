@@ -3,7 +3,7 @@
 Reads   frames, motion    data_spec.md, tables 2 and 3
 Gives   stamps and poses  of the robot in the frame of the first keyframe; keyframes without a pose are left out
 
-None of them is a dependency: `pip install small_gicp kiss-icp pyorbslam3`. pyorbslam3 also needs ORB-SLAM3's
+Of them only small_gicp comes with semslam: `pip install kiss-icp pyorbslam3`. pyorbslam3 also needs ORB-SLAM3's
 vocabulary, whose file its environment variable `PYORBSLAM3_VOCAB` names; `benchmarks/orb_vocabulary.py` makes one.
 """
 

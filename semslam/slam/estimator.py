@@ -1,10 +1,13 @@
-"""What an estimator is: keyframes in, poses out, one step at a time, with a state that can be put away and taken up.
+"""What an estimator is: keyframes in, poses out, with a state that can be put away and taken up.
+
+Most tell each pose at once (`Estimator`); those of whole logs tell all at the end (`WholeLogEstimator`).
 
 Poses are map_from_robot; the map frame is the robot frame of the first keyframe (x ahead, y left).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -106,3 +109,19 @@ class Estimator(Protocol):
 
     def restore(self, state: bytes) -> None:
         """Go on exactly where `state` was taken, bit for bit; the configuration must be the same."""
+
+
+class WholeLogEstimator(Protocol):
+    """A pose track that is told when all keyframes were taken, since later ones correct earlier ones."""
+
+    def step(self, step: Step) -> None:
+        """Take the next keyframe."""
+
+    def finish(self, watch: Callable[[int], None] | None = None) -> list[PoseEstimate]:
+        """The poses of all keyframes; `watch` hears how many rounds over them are done."""
+
+    def part(self) -> bytes:
+        """What was taken in since the last part; equal keyframes give equal bytes."""
+
+    def restore(self, parts: Sequence[bytes]) -> None:
+        """Go on exactly where the last of these was taken, bit for bit; they are all that were taken so far."""

@@ -10,12 +10,14 @@ from pathlib import Path
 from semslam.errors import SemslamError
 from semslam.models.builtin import named_or_shipped
 from semslam.slam.dead_reckoning import DeadReckoning
-from semslam.slam.estimator import Estimator
+from semslam.slam.estimator import Estimator, WholeLogEstimator
 from semslam.slam.paper_estimator import PaperEstimator
 from semslam.stages.settings import LocalizeConfig
 
-NAMES = ("paper", "paper_visual", "dead_reckoning", "mapnet", "deepvo", "orb_rgbd")
-NEEDS_VIEWS = ("mapnet", "deepvo", "orb_rgbd")
+NAMES = ("surfel", "paper", "paper_visual", "dead_reckoning", "mapnet", "deepvo", "orb_rgbd")
+WHOLE_LOGS = ("surfel",)
+"""Those that tell all poses at the end (`WholeLogEstimator`); all others tell each at once (`Estimator`)."""
+NEEDS_VIEWS = ("surfel", "mapnet", "deepvo", "orb_rgbd")
 """Those that look at the pictures themselves (`Step.view`); all others get none."""
 WITHOUT_MOTION = ("paper_visual", "mapnet", "deepvo", "orb_rgbd")
 """Those that never look at the motion."""
@@ -33,9 +35,23 @@ def open_estimator(name: str, config: LocalizeConfig, classes: tuple[str, ...], 
         return PaperEstimator(config.paper, classes, cell_m, side, config.modes, inertial=name == "paper", model=model)
     if name == "dead_reckoning":
         return DeadReckoning()
-    if name in NEEDS_VIEWS:
+    if name in NEEDS_VIEWS and name not in WHOLE_LOGS:
         return _open_viewer(name, config)
-    raise SemslamError(f"There is no estimator `{name}`", hint=f"choose from {', '.join(NAMES)}")
+    steps = [one for one in NAMES if one not in WHOLE_LOGS]
+    raise SemslamError(f"There is no estimator `{name}` that steps", hint=f"choose from {', '.join(steps)}")
+
+
+def open_whole(name: str, config: LocalizeConfig) -> WholeLogEstimator:
+    """The estimator of whole logs of that name.
+
+    Raises:
+        SemslamError: there is none.
+    """
+    if name in WHOLE_LOGS:
+        from semslam.slam.surfel.estimator import SurfelEstimator
+
+        return SurfelEstimator(config.surfel)
+    raise SemslamError(f"There is no estimator of whole logs `{name}`", hint=f"choose from {', '.join(WHOLE_LOGS)}")
 
 
 def model_of(name: str, config: LocalizeConfig) -> Path | None:

@@ -48,7 +48,7 @@ LOCALIZE = Stage(
     writes=(POSES, SNAPSHOTS, CELLS),
     entry="semslam.stages.localize:run",
     variants="estimators",
-    libraries=("numpy", "opencv-contrib-python-headless", "onnxruntime", "pyarrow"),
+    libraries=("numpy", "opencv-contrib-python-headless", "onnxruntime", "gtsam", "small_gicp", "pyarrow"),
 )
 EXPORT = Stage(
     "export",

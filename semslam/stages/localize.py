@@ -10,6 +10,9 @@ Paper   equations 2 to 8 and 10
 
 A step needs all steps before it. Each shard therefore keeps the state after its last keyframe (`state.npz`), and a run
 that goes on takes up the state of the last finished shard: the bytes are those of an undisturbed run.
+
+An estimator of whole logs tells no pose before it has seen the last keyframe. Its shards keep what it took in, and the
+last one holds all rows.
 """
 
 from __future__ import annotations
@@ -26,12 +29,12 @@ from semslam.geometry.grid import Planes, to_dense, to_sparse
 from semslam.labels import UNOBSERVED
 from semslam.models.memory import keep_freed_memory
 from semslam.slam.checkpoint import as_array, pack, unpack
-from semslam.slam.estimator import Belief, Estimator, PoseEstimate, Step
+from semslam.slam.estimator import Belief, PoseEstimate, Step
 from semslam.slam.evidence import Evidence, Snapshot
 from semslam.slam.health import TrackHealth
-from semslam.slam.registry import NEEDS_VIEWS, WITHOUT_MOTION, open_estimator
+from semslam.slam.registry import NEEDS_VIEWS, WHOLE_LOGS, WITHOUT_MOTION, open_estimator, open_whole
 from semslam.slam.views import view_of
-from semslam.stages.contract import FinishedShard, ShardWriter, StageContext, TableSource, row_shards
+from semslam.stages.contract import FinishedShard, ShardWriter, StageContext, TableSink, TableSource, row_shards
 from semslam.stages.settings import LocalizeConfig
 from semslam.tables.spec import CELLS, FRAMES, MOTION, OBSERVATIONS, POSES, SNAPSHOTS
 
@@ -43,10 +46,18 @@ _ROWS_READ = 8
 
 
 def run(ctx: StageContext) -> None:
+    """Estimate the track, and build the map along it."""
+    if ctx.variant in WHOLE_LOGS:
+        _run_whole(ctx)
+    else:
+        _run_stepwise(ctx)
+
+
+def _run_stepwise(ctx: StageContext) -> None:
     """Step through all keyframes, shard by shard."""
     motion, observations = ctx.read(MOTION), ctx.read(OBSERVATIONS)
     frames = ctx.read(FRAMES) if ctx.variant in NEEDS_VIEWS else None
-    track = _Track(ctx, observations.meta)
+    track = _SteppedTrack(ctx, observations.meta)
     keep_freed_memory()
     if ctx.finished:
         track.restore(ctx.finished[-1])
@@ -57,27 +68,52 @@ def run(ctx: StageContext) -> None:
             tables = {table.name: shard.table(table, track.meta) for table in (POSES, SNAPSHOTS, CELLS)}
             steps = _steps(motion, observations, frames, track.shape, start, stop)
             for done, step in enumerate(steps, start + 1):
-                tables["poses"].append(_pose_row(step, track.step(step, shard)))
-                if done % ctx.config.snapshot_every == 0 or done == motion.rows:
-                    tables["snapshots"].append(_snapshot_row(step, track.snapshot()))
+                track.add(step, track.estimate(step), shard, tables, last=done == motion.rows)
                 ctx.progress(done, motion.rows)
             if stop == motion.rows:
-                tables["cells"].append(track.cells())
-                track.warn(shard)
+                track.close(shard, tables)
             shard.path(_STATE).write_bytes(track.state())
 
 
+def _run_whole(ctx: StageContext) -> None:
+    """Take in all keyframes, shard by shard, then tell all poses at once."""
+    motion, observations, frames = ctx.read(MOTION), ctx.read(OBSERVATIONS), ctx.read(FRAMES)
+    config: LocalizeConfig = ctx.config
+    estimator = open_whole(ctx.variant, config)
+    track = _Track(ctx, observations.meta)
+    keep_freed_memory()
+    estimator.restore([(shard.folder / _STATE).read_bytes() for shard in ctx.finished])
+    total = motion.rows + config.surfel.rounds
+    for index, start, stop in row_shards(motion.rows, config.shard_frames):
+        if index < len(ctx.finished):
+            continue
+        with ctx.shard(index) as shard:
+            tables = {table.name: shard.table(table, track.meta) for table in (POSES, SNAPSHOTS, CELLS)}
+            for done, step in enumerate(_steps(motion, observations, frames, track.shape, start, stop), start + 1):
+                estimator.step(step)
+                ctx.progress(done, total)
+            shard.path(_STATE).write_bytes(estimator.part())
+            if stop < motion.rows:
+                continue
+            poses = estimator.finish(lambda rounds: ctx.progress(motion.rows + rounds, total))
+            steps = _steps(motion, observations, None, track.shape, 0, motion.rows)
+            for done, (step, pose) in enumerate(zip(steps, poses, strict=True), 1):
+                track.add(step, pose, shard, tables, last=done == motion.rows)
+            track.close(shard, tables)
+            ctx.progress(total, total)
+
+
 class _Track:
-    """An estimator and the map that grows along its poses."""
+    """A pose track and the map that grows along it."""
 
     def __init__(self, ctx: StageContext, meta: Mapping[str, Any]) -> None:
-        config: LocalizeConfig = ctx.config
+        self._every = int(ctx.config.snapshot_every)
         self._classes = tuple(meta["classes"])
         self._cell_m, self._side = float(meta["cell_m"]), int(meta["side"])
-        self._estimator: Estimator = open_estimator(ctx.variant, config, self._classes, self._cell_m, self._side)
         self._evidence = Evidence(self._cell_m, self._side)
         self._last = SE2(0.0, 0.0, 0.0)
-        self._half_m = _half_side_m(self._estimator.belief())
+        self._half_m = math.inf
+        self._steps = 0
         self._health = TrackHealth(ctx.variant not in WITHOUT_MOTION)
         self._outside = self._unmapped = 0
         self.meta = {"classes": list(self._classes), "cell_m": self._cell_m, "estimator": ctx.variant}
@@ -87,24 +123,34 @@ class _Track:
         """Of an observation."""
         return len(self._classes), self._side, self._side
 
-    def step(self, step: Step, shard: ShardWriter) -> PoseEstimate:
-        """Estimate the pose, then lay the observation on the map there."""
-        estimate = self._estimator.step(step)
+    def add(
+        self, step: Step, estimate: PoseEstimate, shard: ShardWriter, tables: Mapping[str, TableSink], *, last: bool
+    ) -> None:
+        """Take the next pose: lay the observation on the map there, and write what is due."""
         self._health.see(step, estimate)
         shard.count(f"poses_{estimate.source}")
-        if estimate.map_from_robot is None:
-            return estimate
-        self._last = estimate.map_from_robot
-        self._outside += max(abs(self._last.x_m), abs(self._last.y_m)) > self._half_m
-        if step.observation is not None and not self._evidence.add(step.observation, self._last, step.stamp_nanos):
+        if estimate.map_from_robot is not None:
+            self._lay(step, estimate.map_from_robot, shard)
+        self._steps += 1
+        tables["poses"].append(_pose_row(step, estimate))
+        if self._steps % self._every == 0 or last:
+            tables["snapshots"].append(_snapshot_row(step, self.snapshot()))
+
+    def _lay(self, step: Step, pose: SE2, shard: ShardWriter) -> None:
+        self._last = pose
+        self._outside += max(abs(pose.x_m), abs(pose.y_m)) > self._half_m
+        if step.observation is not None and not self._evidence.add(step.observation, pose, step.stamp_nanos):
             shard.count("observations_off_the_map")
             self._unmapped += 1
-        return estimate
 
     def snapshot(self) -> Snapshot:
-        """The estimator's own map, or the cells about the last pose."""
-        belief = self._estimator.belief()
-        return _sparse(belief) if belief else self._evidence.snapshot(self._last)
+        """The cells about the last pose."""
+        return self._evidence.snapshot(self._last)
+
+    def close(self, shard: ShardWriter, tables: Mapping[str, TableSink]) -> None:
+        """Write the whole map, and what there is to warn of."""
+        tables["cells"].append(self.cells())
+        self.warn(shard)
 
     def cells(self) -> dict[str, Any]:
         """Columns of the cells table."""
@@ -125,6 +171,24 @@ class _Track:
                 f"{2 * self._half_m:.1f} m wide about the start; raise `localize.paper.map_side`"
             )
 
+
+class _SteppedTrack(_Track):
+    """With the estimator that makes it step by step."""
+
+    def __init__(self, ctx: StageContext, meta: Mapping[str, Any]) -> None:
+        super().__init__(ctx, meta)
+        self._estimator = open_estimator(ctx.variant, ctx.config, self._classes, self._cell_m, self._side)
+        self._half_m = _half_side_m(self._estimator.belief())
+
+    def estimate(self, step: Step) -> PoseEstimate:
+        """The pose of the next keyframe."""
+        return self._estimator.step(step)
+
+    def snapshot(self) -> Snapshot:
+        """The estimator's own map, or the cells about the last pose."""
+        belief = self._estimator.belief()
+        return _sparse(belief) if belief else super().snapshot()
+
     def state(self) -> bytes:
         """Estimator, map, last pose, and what there is to warn of."""
         parts = {
@@ -133,8 +197,8 @@ class _Track:
             "health": self._health.state(),
         }
         last = np.array([self._last.x_m, self._last.y_m, self._last.heading_rad])
-        off_maps = np.array([self._outside, self._unmapped])
-        return pack({**{name: as_array(part) for name, part in parts.items()}, "last": last, "off_maps": off_maps})
+        counts = np.array([self._outside, self._unmapped, self._steps])
+        return pack({**{name: as_array(part) for name, part in parts.items()}, "last": last, "counts": counts})
 
     def restore(self, shard: FinishedShard) -> None:
         """Go on after a finished shard."""
@@ -143,7 +207,7 @@ class _Track:
         self._evidence.restore(arrays["evidence"].tobytes())
         self._health.restore(arrays["health"].tobytes())
         self._last = SE2(*arrays["last"].tolist())
-        self._outside, self._unmapped = arrays["off_maps"].tolist()
+        self._outside, self._unmapped, self._steps = arrays["counts"].tolist()
 
 
 def _steps(

@@ -188,6 +188,33 @@ class OrbConfig:
     """Keyframes kept for relocalisation; the oldest goes first."""
 
 
+@dataclass(frozen=True)
+class SurfelConfig:
+    """Alignment of depth images with each other, all at once, motion where they say nothing."""
+
+    surfels: int = setting(1200, low=100, high=10000)
+    """Small planes kept of a keyframe, at most."""
+    max_depth_m: float = setting(6.0, low=0.5, high=1000.0)
+    """Farther depth is ignored, metres."""
+    neighbours: int = setting(12, low=2, high=100)
+    """Keyframes that a keyframe is aligned with, at most: those that see most of the same."""
+    position_noise_m: float = setting(0.03, low=1e-6, high=100.0)
+    """Random error of motion over a second along each axis, metres."""
+    heading_noise_rad: float = setting(0.026, low=1e-6, high=10.0)
+    """Random error of the turn over a second, radians."""
+    position_bias_m: float = setting(0.04, low=1e-9, high=100.0)
+    """Steady error of motion over a second, which is estimated: how large it may be (1 sigma), metres."""
+    heading_bias_rad: float = setting(0.02, low=1e-9, high=10.0)
+    """Steady error of the turn over a second, likewise, radians."""
+    tilt_noise_rad: float = setting(0.03, low=1e-6, high=10.0)
+    """How far from upright a keyframe may be found (1 sigma), radians: errors of levelling."""
+    height_noise_m: float = setting(0.3, low=1e-6, high=100.0)
+    """How far above or below the floor that ingest tells a keyframe may be found (1 sigma), metres: for hand-held
+    cameras whose height is only known where they see the floor."""
+    rounds: int = setting(10, low=0, high=100)
+    """Times, at most, that all keyframes are aligned with each other at the end; 0 keeps the track as it was walked."""
+
+
 _PAPER = ("paper", "paper_visual")
 """Estimators that share section `[localize.paper]`."""
 
@@ -198,10 +225,13 @@ class LocalizeConfig:
 
     estimators: tuple[str, ...] = setting(
         ("paper", "paper_visual", "dead_reckoning"),
-        choices=("paper", "paper_visual", "dead_reckoning", "mapnet", "deepvo", "orb_rgbd"),
+        choices=("surfel", "paper", "paper_visual", "dead_reckoning", "mapnet", "deepvo", "orb_rgbd"),
     )
-    """Estimators to run; each gives its own track and map. paper is visual-inertial, paper_visual visual only; mapnet,
-    deepvo and orb_rgbd look at the pictures themselves and never at the motion."""
+    """Estimators to run; each gives its own track and map. surfel aligns the depth images of the whole log and takes
+    motion where they say nothing; paper is visual-inertial, paper_visual visual only; mapnet, deepvo and orb_rgbd look
+    at the pictures themselves and never at the motion."""
+    surfel: SurfelConfig = field(default_factory=SurfelConfig)
+    """Section `[localize.surfel]`."""
     paper: PaperConfig = field(default_factory=PaperConfig)
     """Section `[localize.paper]`."""
     mapnet: MapNetConfig = field(default_factory=MapNetConfig)
@@ -227,6 +257,7 @@ class LocalizeConfig:
         return replace(
             self,
             estimators=(estimator,),
+            surfel=self.surfel if estimator == "surfel" else SurfelConfig(),
             paper=self.paper if estimator in _PAPER else PaperConfig(),
             mapnet=self.mapnet if estimator == "mapnet" else MapNetConfig(),
             deepvo=self.deepvo if estimator == "deepvo" else DeepVoConfig(),

@@ -1,0 +1,132 @@
+"""How surfels of one frame lie on those of another, as normal equations of the pose between them.
+
+A surfel is compared with the nearest one of the other frame that faces the same way: its distance along the mean of
+both normals (symmetric point to plane: S. Rusinkiewicz, A Symmetric Objective Function for ICP, 2019), over the
+standard deviation that the two together have. Distances far beyond it lose their weight (Geman and McClure).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semslam.geometry.frames import Matrix, invert, rotation_from_vector
+from semslam.slam.surfel.surfels import Surfels
+
+Floats = NDArray[np.float64]
+
+_SAME_WAY = 0.85
+"""Least cosine between two normals of one surface: 32 degrees."""
+_OUTLIER = 2.5
+"""Standard deviations at which a distance has a quarter of its weight."""
+_SHARED = 0.2
+"""What a distance counts: those of neighbours err alike, since they come from the same pixels and surfaces."""
+
+
+class Target:
+    """Surfels that others can be aligned with."""
+
+    def __init__(self, surfels: Surfels) -> None:
+        self.surfels = surfels
+
+    @cached_property
+    def tree(self) -> Any:
+        """To find the nearest."""
+        import small_gicp
+
+        return small_gicp.KdTree(self.surfels.points)
+
+    def fit(self, moved: Surfels, reach_m: float) -> Fit:
+        """Compare surfels, already moved into this frame, with the nearest ones up to `reach_m` away."""
+        nothing = np.zeros((0, 3))
+        if not len(moved) or not len(self.surfels):
+            return Fit(nothing, nothing, np.zeros(0), np.zeros(0))
+        found, squared = self.tree.batch_nearest_neighbor_search(moved.points)
+        near = np.asarray(found, np.int64).ravel()
+        cosine = np.einsum("ij,ij->i", moved.normals, self.surfels.normals[near])
+        source = np.flatnonzero((np.asarray(squared).ravel() < reach_m**2) & (cosine > _SAME_WAY))
+        near = near[source]
+        normals = moved.normals[source] + self.surfels.normals[near]
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        points = moved.points[source]
+        distance = np.einsum("ij,ij->i", normals, points - self.surfels.points[near])
+        sigma = np.hypot(moved.sigma_m[source], self.surfels.sigma_m[near])
+        return Fit(points, normals, distance, sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """K surfels beside their nearest ones, in the target's frame."""
+
+    points: Floats
+    """(K, 3) of the source."""
+    normals: Floats
+    """(K, 3) along which they are compared."""
+    distance_m: Floats
+    """(K,) signed."""
+    sigma_m: Floats
+    """(K,) its standard deviation."""
+
+    def __len__(self) -> int:
+        return len(self.distance_m)
+
+    @property
+    def weights(self) -> Floats:
+        """(K,) inverse variances, less for outliers."""
+        share = 1.0 / (1.0 + (self.distance_m / (_OUTLIER * self.sigma_m)) ** 2)
+        return _SHARED * (share / self.sigma_m) ** 2
+
+    def equations(self, about: Floats) -> tuple[Floats, Floats]:
+        """Hessian (6, 6) and gradient (6,) for a turn (3) of the source about a point (3,) and a shift (3)."""
+        turned = np.cross(self.points - about, self.normals)
+        return _equations(np.concatenate([turned, self.normals], 1), self.distance_m, self.weights)
+
+    def pair_equations(self, about_source: Floats, about_target: Floats) -> tuple[Floats, Floats]:
+        """Hessian (12, 12) and gradient (12,) for the source's turn and shift, then the target's."""
+        source = np.concatenate([np.cross(self.points - about_source, self.normals), self.normals], 1)
+        target = -np.concatenate([np.cross(self.points - about_target, self.normals), self.normals], 1)
+        return _equations(np.concatenate([source, target], 1), self.distance_m, self.weights)
+
+    def turned(self, frame_from_target: Matrix) -> Fit:
+        """The same in another frame."""
+        rotation, offset = frame_from_target[:3, :3], frame_from_target[:3, 3]
+        return Fit(self.points @ rotation.T + offset, self.normals @ rotation.T, self.distance_m, self.sigma_m)
+
+
+def _equations(jacobian: Floats, distance: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    weighted = jacobian * weights[:, None]
+    return weighted.T @ jacobian, weighted.T @ distance
+
+
+def nudged(pose: Matrix, change: Floats) -> Matrix:
+    """A pose turned by change[:3] radians about its own place, then shifted by change[3:], both along the axes of its
+    parent."""
+    moved = pose.copy()
+    moved[:3, :3] = rotation_from_vector(change[:3]) @ pose[:3, :3]
+    moved[:3, 3] += change[3:]
+    return moved
+
+
+def change_between(before: Matrix, after: Matrix) -> Floats:
+    """(6,) the change that nudges one pose to another."""
+    turn = after[:3, :3] @ before[:3, :3].T
+    return np.concatenate([rotation_vector(turn), after[:3, 3] - before[:3, 3]])
+
+
+def rotation_vector(rotation: Floats) -> Floats:
+    """(3,) radians about its own direction; the inverse of `rotation_from_vector`, for turns below half a circle."""
+    axis = 0.5 * np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    sine = float(np.linalg.norm(axis))
+    angle = float(np.arctan2(sine, 0.5 * (np.trace(rotation) - 1.0)))
+    return axis if sine < 1e-9 else axis * (angle / sine)
+
+
+def between(first: Matrix, second: Matrix) -> Matrix:
+    """first_from_second, of two poses in one frame."""
+    return invert(first) @ second

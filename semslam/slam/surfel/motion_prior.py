@@ -1,0 +1,78 @@
+"""What measured motion promises: where the robot may be by the next keyframe, and what its sensors get wrong all along.
+
+Motion errs at random, growing with the root of time, and steadily: a wheel that is worn, a gyro that drifts. The steady
+part is the same all through a log, so every step whose true motion was seen by the camera tells about it (a Kalman
+filter of three numbers), and motion across a blind stretch comes out better for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semslam.geometry.frames import SE2, wrap_angle
+from semslam.stages.settings import SurfelConfig
+
+Floats = NDArray[np.float64]
+
+UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S = 0.4, 0.5
+"""Standard deviations of the motion of a robot that does not tell it."""
+_GATE = 16.0
+"""A step whose squared Mahalanobis distance exceeds this tells nothing of steady errors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """A step as motion tells it."""
+
+    motion: SE2
+    covariance: Floats
+    """(3, 3) of x, y and heading in the robot's axes."""
+
+
+@dataclass
+class MotionPrior:
+    """Motion without its steady error, as far as that is known."""
+
+    config: SurfelConfig
+    bias: Floats = field(default_factory=lambda: np.zeros(3))
+    """(3,) m/s, m/s and rad/s by which measured motion is too large."""
+    covariance: Floats = field(default_factory=lambda: np.zeros((3, 3)))
+
+    def __post_init__(self) -> None:
+        self.covariance = np.diag(np.square(bias_sigmas(self.config)))
+
+    def expect(self, motion: SE2 | None, seconds: float) -> Expected:
+        """The true motion of a step for which this was measured."""
+        if motion is None:
+            speed, turn = UNKNOWN_SPEED_M_S * seconds, UNKNOWN_TURN_RAD_S * seconds
+            return Expected(SE2(0.0, 0.0, 0.0), np.diag([speed**2, speed**2, turn**2]))
+        x, y, heading = np.array([motion.x_m, motion.y_m, motion.heading_rad]) - self.bias * seconds
+        random = np.diag(np.square(noise_sigmas(self.config))) * seconds
+        return Expected(SE2(x, y, wrap_angle(heading)), random + seconds**2 * self.covariance)
+
+    def learn(self, motion: SE2, seconds: float, seen: SE2, covariance: Floats) -> None:
+        """Compare measured motion with what was seen of it; `covariance` (3, 3) is that of `seen`."""
+        difference = np.array(
+            [motion.x_m - seen.x_m, motion.y_m - seen.y_m, wrap_angle(motion.heading_rad - seen.heading_rad)]
+        )
+        surprise = difference - self.bias * seconds
+        noise = covariance + np.diag(np.square(noise_sigmas(self.config))) * seconds
+        spread = seconds**2 * self.covariance + noise
+        if seconds <= 0 or surprise @ np.linalg.solve(spread, surprise) > _GATE:
+            return
+        gain = seconds * self.covariance @ np.linalg.inv(spread)
+        self.bias = self.bias + gain @ surprise
+        self.covariance = (np.eye(3) - seconds * gain) @ self.covariance
+
+
+def noise_sigmas(config: SurfelConfig) -> Floats:
+    """(3,) random error of motion over a second: x, y, heading."""
+    return np.array([config.position_noise_m, config.position_noise_m, config.heading_noise_rad])
+
+
+def bias_sigmas(config: SurfelConfig) -> Floats:
+    """(3,) steady error of motion over a second."""
+    return np.array([config.position_bias_m, config.position_bias_m, config.heading_bias_rad])

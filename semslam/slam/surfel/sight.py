@@ -1,0 +1,114 @@
+"""How well two keyframes agree about the space between them: every pixel of one looked up in the other.
+
+Alignment of surfaces tells how to move, and is easily content: a wall slides along a wall. This tells whether the
+result is right. Seen from the true pose, all depth of one picture is found again in the other; from a wrong one edges
+do not meet and things hang in space that was seen through. Where one picture looks past or behind what the other saw
+nothing is said.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semslam.geometry.frames import Matrix, invert
+from semslam.slam.estimator import View
+
+Floats = NDArray[np.float64]
+
+_COLUMNS = 160
+"""Samples along a row of the picture, about; every second of every second row is looked up."""
+_NEAREST_M = 0.3
+_NOISE_M, _NOISE_PER_M = 0.01, 0.004
+"""Differences of depth are measured in _NOISE_M + _NOISE_PER_M * depth^2: noise, and rounding to a sample."""
+_MOST = 3.0
+"""A larger difference counts as this."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What came of looking one picture up in another, and the other in the one."""
+
+    difference: float
+    """Sum of differences of depth, each 0 to 3 standard deviations."""
+    looked_up: int
+    """Samples that fell on one with depth."""
+
+    @property
+    def mean(self) -> float:
+        """Difference of a sample; 3, the worst, where there was none."""
+        return self.difference / self.looked_up if self.looked_up else _MOST
+
+    def __add__(self, other: Agreement) -> Agreement:
+        return Agreement(self.difference + other.difference, self.looked_up + other.looked_up)
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A thinned depth image and its camera."""
+
+    depth_m: NDArray[np.float32]
+    """(h, w), 0 where missing or too far."""
+    intrinsics: tuple[float, float, float, float]
+    """fx, fy, cx, cy of the thinned image."""
+    robot_from_camera: Matrix
+
+    @staticmethod
+    def of(view: View, max_depth_m: float) -> Sight:
+        """Samples of a picture."""
+        step = max(1, round(view.depth_m.shape[1] / _COLUMNS))
+        depth = view.depth_m[step // 2 :: step, step // 2 :: step]
+        known = (depth > _NEAREST_M) & (depth < max_depth_m)
+        inner = ((view.cx - step // 2) / step, (view.cy - step // 2) / step)
+        thinned = np.where(known, depth, np.float32(0)).astype(np.float32)
+        return Sight(thinned, (view.fx / step, view.fy / step, *inner), view.robot_from_camera)
+
+    @cached_property
+    def points(self) -> Floats:
+        """(M, 3) robot frame, of every second sample of every second row."""
+        rows, columns = np.nonzero(self.depth_m[::2, ::2])
+        depth = self.depth_m[::2, ::2][rows, columns].astype(np.float64)
+        fx, fy, cx, cy = self.intrinsics
+        x, y = (2 * columns - cx) / fx, (2 * rows - cy) / fy
+        in_camera = np.stack([x, y, np.ones_like(x)], 1) * depth[:, None]
+        return in_camera @ self.robot_from_camera[:3, :3].T + self.robot_from_camera[:3, 3]
+
+    def look_up(self, points: Floats, robot_from_points: Matrix) -> Agreement:
+        """Points (M, 3) of another frame in this picture."""
+        camera_from_points = invert(self.robot_from_camera) @ robot_from_points
+        x, y, depth = (points @ camera_from_points[:3, :3].T + camera_from_points[:3, 3]).T
+        ahead = np.flatnonzero(depth > _NEAREST_M)
+        x, y, depth = x[ahead], y[ahead], depth[ahead]
+        fx, fy, cx, cy = self.intrinsics
+        column, row = (np.rint(value).astype(np.int64) for value in (x / depth * fx + cx, y / depth * fy + cy))
+        height, width = self.depth_m.shape
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        measured = self.depth_m[row[inside], column[inside]].astype(np.float64)
+        known = measured > 0
+        measured, depth = measured[known], depth[inside][known]
+        apart = np.abs(depth - measured) / (_NOISE_M + _NOISE_PER_M * measured**2)
+        return Agreement(float(np.minimum(apart, _MOST).sum()), len(apart))
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Everything, to be kept."""
+        return {
+            "depth": self.depth_m,
+            "intrinsics": np.array(self.intrinsics),
+            "robot_from_camera": self.robot_from_camera,
+        }
+
+    @staticmethod
+    def from_arrays(arrays: dict[str, NDArray[Any]]) -> Sight:
+        """The inverse of `arrays`."""
+        fx, fy, cx, cy = arrays["intrinsics"].tolist()
+        return Sight(arrays["depth"], (fx, fy, cx, cy), arrays["robot_from_camera"])
+
+
+def agreement(first: Sight, second: Sight, first_from_second: Matrix) -> Agreement:
+    """Each looked up in the other."""
+    there = first.look_up(second.points, first_from_second)
+    return there + second.look_up(first.points, invert(first_from_second))

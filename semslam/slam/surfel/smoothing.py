@@ -1,0 +1,217 @@
+"""All keyframes of a log aligned with each other at once: surfaces seen twice tie any two keyframes, whenever they were
+taken, motion ties neighbours in time, and its steady error is one more unknown.
+
+Each round finds the pairs of keyframes that see most of the same, compares their surfels, and solves the normal
+equations of all poses together (gtsam, sparse Cholesky). Going round a room thereby closes the loop, and a first
+keyframe that later ones hardly saw is still held by those that did.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semslam.geometry.frames import Matrix
+from semslam.slam.surfel.alignment import between, change_between, nudged, rotation_vector
+from semslam.slam.surfel.motion_prior import UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S, bias_sigmas, noise_sigmas
+from semslam.slam.surfel.sight import agreement
+from semslam.slam.surfel.tracking import Keyframe, Place, unlevel, voxels_of
+from semslam.stages.settings import SurfelConfig
+
+Floats = NDArray[np.float64]
+
+_REACHES_M = (0.15, 0.1, 0.08, 0.06)
+"""Of the rounds; later ones reach as far as the last."""
+_LEAST_SHARED = 0.15
+"""Share of the smaller one's voxels that two keyframes must have in common."""
+_MIN_MATCHES = 30
+_WORST = 1.6
+"""Mean difference of two pictures, in standard deviations, above which the pair is left out."""
+_STILL = 1e-3
+"""Metres and radians of a change that is no improvement any more."""
+_SHORTEST_S = 1e-3
+_FREE = 1e-3
+"""Keeps what nothing ties solvable."""
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """What came of it."""
+
+    places: list[Place]
+    bias: Floats
+    """(3,) steady error of motion, m/s, m/s, rad/s."""
+    tied: list[bool]
+    """Whether surfaces tie a keyframe to another."""
+
+
+def smooth(
+    places: Sequence[Place], bias: Floats, config: SurfelConfig, watch: Callable[[int], None] | None = None
+) -> Smoothed:
+    """Align all places with each other; `watch` hears of each round."""
+    result = Smoothed(list(places), bias, [place.linked for place in places])
+    for number in range(config.rounds):
+        reach_m = _REACHES_M[min(number, len(_REACHES_M) - 1)]
+        before, result = result, _round(result, reach_m, config)
+        if watch:
+            watch(number + 1)
+        if number >= len(_REACHES_M) and _settled(before.places, result.places):
+            break
+    return result
+
+
+def _settled(before: Sequence[Place], after: Sequence[Place]) -> bool:
+    """Whether no pose has changed by more than `_STILL`."""
+    changes = [change_between(one.pose, other.pose) for one, other in zip(before, after, strict=True)]
+    return bool(np.abs(changes).max(initial=0.0) < _STILL)
+
+
+def _round(before: Smoothed, reach_m: float, config: SurfelConfig) -> Smoothed:
+    places = before.places
+    equations = _Equations(len(places))
+    tied = [False] * len(places)
+    for first, second in pairs_of(places, config.neighbours):
+        if _tie(equations, places, first, second, reach_m):
+            tied[first] = tied[second] = True
+    for index in range(len(places)):
+        _level(equations, places, index, config)
+        if index:
+            _move(equations, places, index, before.bias, config)
+    equations.add((equations.bias,), np.diag(1.0 / bias_sigmas(config) ** 2), before.bias / bias_sigmas(config) ** 2)
+    changes = equations.solved()
+    moved = [nudged(place.pose, change) for place, change in zip(places, changes[:-1], strict=True)]
+    after = [
+        replace(place, pose=pose, voxels=voxels_of(place.keyframe, pose))
+        for place, pose in zip(places, moved, strict=True)
+    ]
+    return Smoothed(after, before.bias + changes[-1], tied)
+
+
+def pairs_of(places: Sequence[Place], most: int) -> list[tuple[int, int]]:
+    """Keyframes that see the same: of each those, at most so many, with which it shares most voxels; and neighbours."""
+    shared = _shared_voxels([place.voxels for place in places])
+    found = {(index, index + 1) for index in range(len(places) - 1)}
+    for index, others in enumerate(shared):
+        sizes = {other: count for other, count in others.items() if _enough(places, index, other, count)}
+        for other in sorted(sizes, key=lambda one: (-sizes[one], one))[:most]:
+            found.add((min(index, other), max(index, other)))
+    pictured = [place.keyframe is not None for place in places]
+    return [(first, second) for first, second in sorted(found) if pictured[first] and pictured[second]]
+
+
+def _enough(places: Sequence[Place], first: int, second: int, shared: int) -> bool:
+    return shared >= _LEAST_SHARED * min(len(places[first].voxels), len(places[second].voxels))
+
+
+def _shared_voxels(voxels: Sequence[NDArray[np.int64]]) -> list[dict[int, int]]:
+    """Of each keyframe, how many voxels it shares with which others."""
+    owner = np.repeat(np.arange(len(voxels)), [len(one) for one in voxels])
+    numbers = np.concatenate([*voxels, np.zeros(0, np.int64)])
+    order = np.argsort(numbers, kind="stable")
+    owner, numbers = owner[order], numbers[order]
+    ends = np.flatnonzero(numbers[1:] != numbers[:-1]) + 1
+    shared: list[dict[int, int]] = [{} for _ in voxels]
+    for group in np.split(owner, ends):
+        for first in group.tolist():
+            counts = shared[first]
+            for second in group.tolist():
+                if first != second:
+                    counts[second] = counts.get(second, 0) + 1
+    return shared
+
+
+def _tie(equations: _Equations, places: Sequence[Place], first: int, second: int, reach_m: float) -> bool:
+    """Compare the surfels of two keyframes, either way round; False if they do not see the same after all."""
+    one, other = places[first], places[second]
+    if not (one.keyframe and other.keyframe):
+        return False
+    if agreement(one.keyframe.sight, other.keyframe.sight, between(one.pose, other.pose)).mean > _WORST:
+        return False
+    there = _compare(equations, (first, one.keyframe, one.pose), (second, other.keyframe, other.pose), reach_m)
+    back = _compare(equations, (second, other.keyframe, other.pose), (first, one.keyframe, one.pose), reach_m)
+    return there or back
+
+
+def _compare(
+    equations: _Equations, source: tuple[int, Keyframe, Matrix], target: tuple[int, Keyframe, Matrix], reach_m: float
+) -> bool:
+    """Lay one keyframe's surfels on another's; False if too few come to lie there."""
+    (index, keyframe, pose), (toward, known, place) = source, target
+    fit = known.target.fit(keyframe.surfels.moved(between(place, pose)), reach_m)
+    if len(fit) < _MIN_MATCHES:
+        return False
+    equations.add((index, toward), *fit.turned(place).pair_equations(pose[:3, 3], place[:3, 3]))
+    return True
+
+
+def _level(equations: _Equations, places: Sequence[Place], index: int, config: SurfelConfig) -> None:
+    """The robot stands upright on its floor; the first keyframe's place and heading are the map frame's."""
+    tilt, height = config.tilt_noise_rad**-2, config.height_noise_m**-2
+    held = 1e8 if index == 0 else _FREE
+    weight = np.diag([tilt, tilt, held, held, held, height])
+    error = unlevel(places[index].pose) if index else unlevel(places[0].pose) * [1, 1, 0, 0, 0, 1]
+    equations.add((index,), weight, weight @ error)
+
+
+def _move(equations: _Equations, places: Sequence[Place], index: int, bias: Floats, config: SurfelConfig) -> None:
+    """Motion between neighbours in time, less its steady error; of a robot that does not tell it, what is likely."""
+    before, place = places[index - 1], places[index]
+    seconds = max(place.seconds, _SHORTEST_S)
+    if place.motion is None:
+        x, y, turn, steady = 0.0, 0.0, 0.0, 0.0
+        noise = np.array([UNKNOWN_SPEED_M_S, UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S]) ** 2 * seconds**2
+    else:
+        measured = np.array([place.motion.x_m, place.motion.y_m, place.motion.heading_rad])
+        x, y, turn = measured - bias * seconds
+        noise, steady = noise_sigmas(config) ** 2 * seconds, seconds
+    shift = before.pose[:3, :3] @ np.array([x, y, 0.0])
+    turned = before.pose[:3, :3] @ _about_z(turn)
+    error = np.concatenate(
+        [rotation_vector(place.pose[:3, :3] @ turned.T), place.pose[:3, 3] - before.pose[:3, 3] - shift]
+    )
+    jacobian = np.zeros((6, 15))  # of a change of the pose before, of this one, and of the bias
+    jacobian[:, 6:12] = np.eye(6)
+    jacobian[:3, :3] = jacobian[3:, 3:6] = -np.eye(3)
+    jacobian[3:, :3] = [[0, -shift[2], shift[1]], [shift[2], 0, -shift[0]], [-shift[1], shift[0], 0]]
+    jacobian[2, 14] = steady
+    jacobian[3:, 12:14] = before.pose[:3, :2] * steady
+    weight = np.diag([_FREE, _FREE, 1 / noise[2], 1 / noise[0], 1 / noise[1], _FREE])
+    weighted = jacobian.T @ weight
+    equations.add((index - 1, index, equations.bias), weighted @ jacobian, weighted @ error)
+
+
+def _about_z(angle_rad: float) -> Floats:
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
+class _Equations:
+    """Normal equations of all poses and the bias."""
+
+    def __init__(self, poses: int) -> None:
+        import gtsam  # loading it takes a tenth of a second
+
+        self._gtsam: Any = gtsam
+        self._graph: Any = gtsam.GaussianFactorGraph()
+        self.bias = poses
+        """Key of the bias; poses have the keys before it."""
+
+    def add(self, keys: tuple[int, ...], hessian: Floats, gradient: Floats) -> None:
+        """Add the squares whose Hessian and gradient, for the unknowns of `keys` in a row, are these."""
+        sizes = [3 if key == self.bias else 6 for key in keys]
+        ends = np.cumsum(sizes)
+        parts = [slice(end - size, end) for end, size in zip(ends.tolist(), sizes, strict=True)]
+        blocks: list[Any] = []
+        for number, part in enumerate(parts):
+            blocks += [hessian[part, other] for other in parts[number:]]
+            blocks.append(-gradient[part])
+        self._graph.add(self._gtsam.HessianFactor(*keys, *blocks, 0.0))
+
+    def solved(self) -> list[Floats]:
+        """The changes of all poses (6,), then that of the bias (3,)."""
+        found = self._graph.optimize()
+        return [np.asarray(found.at(key)) for key in range(self.bias + 1)]

@@ -1,0 +1,282 @@
+"""Through a log keyframe by keyframe: expect where the robot is, find it among what was seen before, remember.
+
+Alignment converges from a decimetre or two and is then content wherever a wall may slide along a wall. So several
+starts are tried, over all headings that motion leaves open and, along the direction that surfaces hold worst, over
+several places; what agrees best with the pictures around it (`sight`) and with the motion is taken.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semslam.geometry.frames import SE2, Matrix, planar
+from semslam.slam.estimator import View
+from semslam.slam.surfel.alignment import Fit, Target, between, change_between, nudged
+from semslam.slam.surfel.motion_prior import MotionPrior
+from semslam.slam.surfel.sight import Agreement, Sight, agreement
+from semslam.slam.surfel.surfels import Surfels, surfels_of
+from semslam.stages.settings import SurfelConfig
+
+Floats = NDArray[np.float64]
+
+VOXEL_M = 0.25
+"""Keyframes that have surfels in the same voxels see the same."""
+_COARSE = 3
+"""Every third surfel will do for a first look."""
+_FIRST_REACH_M, _REACH_M, _SHRINK = 0.3, 0.1, 0.7
+_ROUNDS, _COARSE_ROUNDS = 12, 5
+_STILL = 1e-4
+"""Metres and radians of a change that need no other."""
+_HEADING_STEP_RAD = math.radians(1.0)
+_MOST_STARTS = 25
+_OPEN_SIGMAS = 2.5
+_STARTS_KEPT = 2
+_BESIDE_M = (-0.1, -0.05, 0.05, 0.1)
+_TIMES_BESIDE = 3
+_REFERENCES = 3
+"""Keyframes with whose pictures a pose must agree."""
+_WORTH = 300.0
+"""Independent samples of a picture: what a difference of one standard deviation everywhere weighs against motion."""
+_TOO_FEW = 0.04
+"""Share of samples that must be found again, or the pictures have nothing in common."""
+_MIN_MATCHES = 40
+_WORST = 1.6
+"""Mean difference, in standard deviations, above which two pictures do not show the same place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """What a keyframe saw, in its robot frame."""
+
+    surfels: Surfels
+    sight: Sight
+
+    @staticmethod
+    def of(view: View, config: SurfelConfig) -> Keyframe:
+        """Of its pictures."""
+        return Keyframe(surfels_of(view, config.surfels, config.max_depth_m), Sight.of(view, config.max_depth_m))
+
+    @cached_property
+    def target(self) -> Target:
+        """Its surfels, for others to be aligned with."""
+        return Target(self.surfels)
+
+    @cached_property
+    def coarse(self) -> Surfels:
+        """Some of its surfels."""
+        return self.surfels.every(_COARSE)
+
+
+@dataclass(eq=False)
+class Place:
+    """A keyframe and where it was taken; without pictures there is only the place."""
+
+    keyframe: Keyframe | None
+    pose: Matrix
+    """map_from_robot, (4, 4)."""
+    seconds: float
+    """Since the keyframe before."""
+    motion: SE2 | None
+    """Measured since then."""
+    linked: bool
+    """Whether the pose was seen, not only expected."""
+    voxels: NDArray[np.int64]
+    """Those with surfels, rising."""
+
+
+class Track:
+    """All keyframes so far, with the poses at which they were found.
+
+    While nothing is found the poses are those of motion alone, and the search grows wider with every step.
+    """
+
+    def __init__(self, config: SurfelConfig) -> None:
+        self._config = config
+        self.places: list[Place] = []
+        self.prior = MotionPrior(config)
+        self.open = np.zeros((3, 3))
+        """Covariance of what motion alone has told since a pose was seen."""
+
+    def step(self, keyframe: Keyframe | None, motion: SE2 | None, seconds: float) -> Place:
+        """Take the next keyframe; `seconds` since the one before, at which `motion` began."""
+        if not self.places:
+            return self._remember(keyframe, np.eye(4), 0.0, None, linked=True)
+        before = self.places[-1]
+        expected = self.prior.expect(motion, seconds)
+        start = before.pose @ matrix_of(expected.motion)
+        covariance = self.open + expected.covariance
+        found = self._find(keyframe, start, covariance) if keyframe else None
+        if found is None:
+            self.open = covariance
+            return self._remember(keyframe, start, seconds, motion, linked=False)
+        self.open = np.zeros((3, 3))
+        pose, hessian = found
+        if motion is not None and before.linked:
+            seen, unsure = planar(between(before.pose, pose)), _covariance_in_robot(hessian, before.pose)
+            self.prior.learn(motion, seconds, seen, unsure)
+        return self._remember(keyframe, pose, seconds, motion, linked=True)
+
+    def _remember(
+        self, keyframe: Keyframe | None, pose: Matrix, seconds: float, motion: SE2 | None, *, linked: bool
+    ) -> Place:
+        place = Place(keyframe, pose, seconds, motion, linked, voxels_of(keyframe, pose))
+        self.places.append(place)
+        return place
+
+    def _find(self, keyframe: Keyframe, start: Matrix, covariance: Floats) -> tuple[Matrix, Floats] | None:
+        """Pose and Hessian (6, 6) of the surfaces alone; None if what was seen before does not show it."""
+        near = self._near(voxels_of(keyframe, start))
+        parts = [(place.keyframe, place.pose) for place in near if place.keyframe]
+        if not parts:
+            return None
+        return Search(keyframe, parts, start, covariance, self._config).result()
+
+    def _near(self, voxels: NDArray[np.int64]) -> list[Place]:
+        """The places that see most of the same, and the last, best first."""
+        shared = [len(np.intersect1d(voxels, place.voxels, assume_unique=True)) for place in self.places]
+        shared[-1] = len(voxels) + 1
+        order = np.argsort(-np.array(shared), kind="stable")[: self._config.neighbours]
+        return [self.places[i] for i in order if shared[i]]
+
+
+class Search:
+    """The pose of a keyframe among others whose poses are known."""
+
+    def __init__(
+        self,
+        keyframe: Keyframe,
+        known: Sequence[tuple[Keyframe, Matrix]],
+        start: Matrix,
+        covariance: Floats,
+        config: SurfelConfig,
+    ) -> None:
+        """`known`: keyframes with their poses, best first; `covariance` (3, 3) of the start's x, y and heading."""
+        self._keyframe = keyframe
+        self._known = known
+        self._start = start
+        self._target = Target(Surfels.joined([other.surfels.moved(pose) for other, pose in known]))
+        self._sigma_m = math.sqrt(max(covariance[0, 0], covariance[1, 1]))
+        self._sigma_rad = math.sqrt(covariance[2, 2])
+        level, height = 1.0 / config.tilt_noise_rad**2, 1.0 / config.height_noise_m**2
+        self._level = np.diag([level, level, 0.0, 0.0, 0.0, height])
+        shift = 1.0 / self._sigma_m**2
+        self._motion = np.diag([0.0, 0.0, 1.0 / self._sigma_rad**2, shift, shift, 0.0])
+
+    def result(self) -> tuple[Matrix, Floats] | None:
+        """The best pose and its Hessian; None if none will do."""
+        poses = [self._refined(start, _COARSE_ROUNDS, coarse=True)[0] for start in self._starts()]
+        pose = min(poses, key=self._cost)
+        pose = self._beside(pose)
+        pose, fit = self._refined(pose, _ROUNDS, coarse=False)
+        seen = self._agreement(pose)
+        if len(fit) < _MIN_MATCHES or self._too_few(seen) or seen.mean > _WORST:
+            return None
+        return pose, fit.equations(pose[:3, 3])[0]
+
+    def _starts(self) -> list[Matrix]:
+        """Headings that agree best, none beside another."""
+        half = max(1, math.ceil(_OPEN_SIGMAS * self._sigma_rad / _HEADING_STEP_RAD))
+        step = max(_HEADING_STEP_RAD, 2 * half * _HEADING_STEP_RAD / (_MOST_STARTS - 1))
+        half = math.ceil(half * _HEADING_STEP_RAD / step)
+        turns = range(-half, half + 1)
+        costs = {turn: self._cost(self._start @ matrix_of(SE2(0.0, 0.0, turn * step))) for turn in turns}
+        kept: list[int] = []
+        for turn in sorted(turns, key=lambda one: (costs[one], abs(one))):
+            if len(kept) < _STARTS_KEPT and all(abs(turn - other) > 1 for other in kept):
+                kept.append(turn)
+        return [self._start @ matrix_of(SE2(0.0, 0.0, turn * step)) for turn in kept]
+
+    def _beside(self, pose: Matrix) -> Matrix:
+        """Look left and right along the direction that the surfaces hold worst, as long as that gets better."""
+        cost = self._cost(pose)
+        for _ in range(_TIMES_BESIDE):
+            hessian, _ = self._fit(pose, _REACH_M, coarse=True).equations(pose[:3, 3])
+            direction = _weakest(hessian + self._level)
+            places = [nudged(pose, np.array([0.0, 0.0, 0.0, *(away * direction), 0.0])) for away in _BESIDE_M]
+            best = min(places, key=self._cost)
+            if self._cost(best) >= cost:
+                break
+            tried = self._refined(best, _COARSE_ROUNDS, coarse=True, reach_m=_REACH_M)[0]
+            pose = min((best, tried), key=self._cost)
+            cost = self._cost(pose)
+        return pose
+
+    def _refined(
+        self, pose: Matrix, rounds: int, *, coarse: bool, reach_m: float = _FIRST_REACH_M
+    ) -> tuple[Matrix, Fit]:
+        """Gauss-Newton on surfaces, level and motion together."""
+        if not coarse:
+            reach_m = min(reach_m, 1.5 * _REACH_M)
+        for _ in range(rounds):
+            fit = self._fit(pose, reach_m, coarse=coarse)
+            hessian, gradient = fit.equations(pose[:3, 3])
+            for weight, error in ((self._level, unlevel(pose)), (self._motion, change_between(self._start, pose))):
+                hessian, gradient = hessian + weight, gradient + weight @ error
+            change = np.asarray(-np.linalg.solve(hessian, gradient), np.float64)
+            pose = nudged(pose, change)
+            if np.abs(change).max() < _STILL and reach_m <= _REACH_M:
+                break
+            reach_m = max(_REACH_M, reach_m * _SHRINK)
+        return pose, fit
+
+    def _fit(self, pose: Matrix, reach_m: float, *, coarse: bool) -> Fit:
+        surfels = self._keyframe.coarse if coarse else self._keyframe.surfels
+        return self._target.fit(surfels.moved(pose), reach_m)
+
+    def _cost(self, pose: Matrix) -> float:
+        """Of pictures that disagree and of motion that is unlikely."""
+        seen = self._agreement(pose)
+        mean = Agreement(0.0, 0).mean if self._too_few(seen) else seen.mean
+        error = change_between(self._start, pose)
+        return _WORTH * mean + 0.5 * float(error @ self._motion @ error)
+
+    def _agreement(self, pose: Matrix) -> Agreement:
+        whole = Agreement(0.0, 0)
+        for other, place in self._known[:_REFERENCES]:
+            whole += agreement(other.sight, self._keyframe.sight, between(place, pose))
+        return whole
+
+    def _too_few(self, seen: Agreement) -> bool:
+        return seen.looked_up < _TOO_FEW * 2 * len(self._keyframe.sight.points) + 1
+
+
+def matrix_of(pose: SE2) -> Matrix:
+    """A pose on the floor as a matrix."""
+    matrix = np.eye(4)
+    cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+    matrix[:2] = [[cosine, -sine, 0.0, pose.x_m], [sine, cosine, 0.0, pose.y_m]]
+    return matrix
+
+
+def voxels_of(keyframe: Keyframe | None, pose: Matrix) -> NDArray[np.int64]:
+    """Voxels in which the keyframe has surfels, numbered, rising."""
+    if keyframe is None:
+        return np.zeros(0, np.int64)
+    cells = np.floor(keyframe.surfels.moved(pose).points / VOXEL_M).astype(np.int64) + (1 << 20)
+    return np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2])
+
+
+def unlevel(pose: Matrix) -> Floats:
+    """(6,) tilt of a pose as a turn from the upright, and its height above the floor."""
+    return np.array([-pose[1, 2], pose[0, 2], 0.0, 0.0, 0.0, pose[2, 3]])
+
+
+def _weakest(hessian: Floats) -> Floats:
+    """(2,) unit vector on the floor along which a pose is held worst, whatever its turn."""
+    keep, rest = [3, 4], [0, 1, 2, 5]
+    tied = hessian[np.ix_(keep, rest)] @ np.linalg.pinv(hessian[np.ix_(rest, rest)]) @ hessian[np.ix_(rest, keep)]
+    return np.asarray(np.linalg.eigh(hessian[np.ix_(keep, keep)] - tied)[1][:, 0])
+
+
+def _covariance_in_robot(hessian: Floats, before: Matrix) -> Floats:
+    """(3, 3) of x, y and heading along the axes of the pose before."""
+    whole = np.linalg.inv(hessian + np.diag([1e4, 1e4, 1e2, 1e1, 1e1, 1e4]))[np.ix_([3, 4, 2], [3, 4, 2])]
+    turn = np.eye(3)
+    turn[:2, :2] = before[:2, :2].T
+    return np.asarray(turn @ whole @ turn.T)

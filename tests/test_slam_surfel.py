@@ -1,0 +1,304 @@
+"""Depth aligned with depth: surfels lie on surfaces, pictures agree from true poses only, and tracks are right."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from semslam.geometry.frames import FLU_FROM_OPTICAL, SE2
+from semslam.slam.estimator import PoseEstimate, Step, View
+from semslam.slam.surfel.alignment import Target, change_between, nudged
+from semslam.slam.surfel.estimator import SurfelEstimator
+from semslam.slam.surfel.motion_prior import MotionPrior
+from semslam.slam.surfel.sight import Sight, agreement
+from semslam.slam.surfel.surfels import surfels_of
+from semslam.slam.surfel.tracking import Keyframe
+from semslam.stages import localize
+from semslam.stages.contract import FinishedShard
+from semslam.stages.settings import LocalizeConfig, SurfelConfig
+from semslam.tables.parquet import TableFiles, write_table
+from semslam.tables.pictures import encode_colour, encode_depth
+from semslam.tables.spec import CELLS, FRAMES, POSES, SNAPSHOTS
+from tests.depth_world import ROBOT_FROM_CAMERA, make_drive, make_room, make_views, matrix
+from tests.slam_world import MemoryContext, make_walk, make_world, write_inputs
+
+CONFIG = SurfelConfig()
+BIAS = SE2(0.02, -0.02, 0.01)
+
+
+def track(steps: list[Step], config: SurfelConfig = CONFIG) -> list[PoseEstimate]:
+    estimator = SurfelEstimator(config)
+    for step in steps:
+        estimator.step(step)
+    return estimator.finish()
+
+
+def errors(found: list[PoseEstimate], drive: list[SE2]) -> tuple[float, float]:
+    """The worst position error in metres and heading error in degrees, in the frame of the first pose."""
+    apart = []
+    for estimate, true in zip(found, drive, strict=True):
+        assert estimate.map_from_robot is not None
+        apart.append(drive[0].between(true).between(estimate.map_from_robot))
+    return max(math.hypot(one.x_m, one.y_m) for one in apart), max(math.degrees(abs(one.heading_rad)) for one in apart)
+
+
+def reckoned(steps: list[Step]) -> list[PoseEstimate]:
+    poses = [SE2(0.0, 0.0, 0.0)]
+    for step in steps[1:]:
+        assert step.motion is not None
+        poses.append(poses[-1] @ step.motion)
+    return [PoseEstimate(pose, "inertial") for pose in poses]
+
+
+# --- surfels ----------------------------------------------------------------------------------------------------------
+
+
+def plane_view(normal: tuple[float, float, float], distance_m: float, noise: float) -> View:
+    """A plane n . X = d of the camera frame, seen with noise of inverse depth."""
+    column, row = np.meshgrid(np.arange(160), np.arange(120))
+    rays = np.stack([(column - 79.5) / 80.0, (row - 59.5) / 80.0, np.ones_like(column)], -1)
+    inverse = rays @ np.array(normal) / distance_m
+    inverse = inverse + noise * np.random.default_rng(0).standard_normal(inverse.shape)
+    depth = np.where(inverse > 0.05, 1 / np.maximum(inverse, 0.05), 0.0).astype(np.float32)
+    return View(np.zeros((120, 160, 3), np.uint8), depth, 80.0, 80.0, 79.5, 59.5, FLU_FROM_OPTICAL)
+
+
+@pytest.mark.parametrize("turn_deg", [0, 30, 60])
+def test_surfels_lie_on_the_plane(turn_deg: float) -> None:
+    """At their distance within what they promise, facing the camera, all with the plane's direction."""
+    angle = math.radians(turn_deg)
+    normal = (math.sin(angle), 0.0, math.cos(angle))
+    found = surfels_of(plane_view(normal, 2.0, 0.002), 1000, 6.0)
+    assert len(found) > 900
+    toward = FLU_FROM_OPTICAL[:3, :3] @ np.array(normal)
+    off = np.abs(found.points @ toward - 2.0)
+    assert (off < 4 * found.sigma_m).all()
+    assert off.mean() < 0.01
+    assert (found.normals @ -toward > math.cos(math.radians(20))).all()
+
+
+def test_edges_and_holes_make_no_surfels() -> None:
+    """A step between two planes is no slanted wall, and missing depth is nothing."""
+    view = plane_view((0.0, 0.0, 1.0), 2.0, 0.0)
+    view.depth_m[:, 80:] = 4.0
+    view.depth_m[:40] = 0.0
+    found = surfels_of(view, 2000, 6.0)
+    depth = found.points[:, 0]  # forward
+    assert (np.minimum(np.abs(depth - 2.0), np.abs(depth - 4.0)) < 0.01).all()
+    assert len(surfels_of(replace(view, depth_m=np.zeros_like(view.depth_m)), 100, 6.0)) == 0
+
+
+def test_rare_directions_are_kept() -> None:
+    """Of a floor and a few small faces the faces lose least."""
+    view = make_room().view(np.eye(4))
+    few, many = surfels_of(view, 200, 8.0), surfels_of(view, 5000, 8.0)
+    assert len(few) <= 200 < len(many)
+
+    def share_of_floor(normals: NDArray[np.float64]) -> float:
+        return float((normals[:, 2] > 0.9).mean())
+
+    assert share_of_floor(few.normals) < share_of_floor(many.normals)
+
+
+# --- agreement and alignment ------------------------------------------------------------------------------------------
+
+
+def test_pictures_agree_from_the_true_pose() -> None:
+    """Better than from any pose a little off, although walls and floor slide along themselves."""
+    room = make_room()
+    first, second = matrix(SE2(0.0, 0.0, 0.0)), matrix(SE2(0.4, 0.1, 0.3))
+    one, other = (Sight.of(room.view(pose), 8.0) for pose in (first, second))
+    best = agreement(one, other, second)
+    assert best.mean < 0.5
+    assert best.looked_up > 500
+    for off in (SE2(0.1, 0.0, 0.0), SE2(0.0, 0.1, 0.0), SE2(0.0, -0.1, 0.0), SE2(0.0, 0.0, 0.05)):
+        assert agreement(one, other, second @ matrix(off)).mean > best.mean + 0.1
+    nowhere = agreement(one, other, matrix(SE2(-50.0, 0.0, math.pi / 2)))
+    assert (nowhere.looked_up, nowhere.mean) == (0, 3.0)
+
+
+def test_alignment_finds_a_small_change_back() -> None:
+    """Gauss-Newton on the equations of a fit."""
+    room = make_room()
+    one, other = (Keyframe.of(room.view(matrix(SE2(x, 0.0, 0.0))), CONFIG) for x in (0.0, 0.3))
+    true, pose = matrix(SE2(0.3, 0.0, 0.0)), matrix(SE2(0.34, -0.03, 0.03))
+    target = Target(one.surfels)
+    for reach in (0.3, 0.2, 0.15, 0.1, 0.1, 0.1):
+        hessian, gradient = target.fit(other.surfels.moved(pose), reach).equations(pose[:3, 3])
+        pose = nudged(pose, -np.linalg.solve(hessian, gradient))
+    change = change_between(true, pose)
+    assert np.abs(change[:3]).max() < 0.004
+    assert np.abs(change[3:]).max() < 0.012
+
+
+def test_a_change_and_back() -> None:
+    """`change_between` undoes `nudged`."""
+    pose = matrix(SE2(1.0, 2.0, 0.5))
+    change = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6])
+    np.testing.assert_allclose(change_between(pose, nudged(pose, change)), change, atol=1e-12)
+
+
+def test_nothing_fits_nothing() -> None:
+    """No surfels on either side: no matches, and no crash."""
+    some = Keyframe.of(make_room().view(np.eye(4)), CONFIG).surfels
+    none = some.every(1).moved(np.eye(4))
+    empty = type(some)(none.points[:0], none.normals[:0], none.sigma_m[:0])
+    assert len(Target(empty).fit(some, 0.1)) == len(Target(some).fit(empty, 0.1)) == 0
+
+
+# --- motion -----------------------------------------------------------------------------------------------------------
+
+
+def test_steady_errors_of_motion_are_learned() -> None:
+    """From steps whose true motion was seen; the next step is then expected right, and more surely."""
+    prior = MotionPrior(CONFIG)
+    before = prior.expect(SE2(0.2, 0.0, 0.1), 1.0)
+    for _ in range(30):
+        prior.learn(SE2(0.22, -0.02, 0.11), 1.0, SE2(0.2, 0.0, 0.1), np.diag([1e-5] * 3))
+    after = prior.expect(SE2(0.22, -0.02, 0.11), 1.0)
+    assert (after.motion.x_m, after.motion.y_m, after.motion.heading_rad) == pytest.approx((0.2, 0.0, 0.1), abs=2e-3)
+    assert np.trace(after.covariance) < np.trace(before.covariance)
+    assert np.trace(prior.expect(None, 1.0).covariance) > 10 * np.trace(before.covariance)
+
+
+# --- tracks -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_drive_is_found_to_the_centimetre() -> None:
+    """Where motion alone errs by decimetres and many degrees; its steady error is no obstacle."""
+    drive = make_drive()
+    steps = make_views(make_room(), drive, bias=BIAS, noise_m=0.03, noise_rad=0.05)
+    assert errors(reckoned(steps), drive)[0] > 0.15
+    assert errors(reckoned(steps), drive)[1] > 5.0
+    found = track(steps)
+    worst_m, worst_deg = errors(found, drive)
+    assert worst_m < 0.02
+    assert worst_deg < 0.5
+    assert [one.source for one in found] == ["start", *["visual"] * (len(drive) - 1)]
+    assert found[0].map_from_robot == SE2(0.0, 0.0, 0.0)
+
+
+def test_smoothing_makes_it_better() -> None:
+    """All keyframes together know more than each did when it came."""
+    drive = make_drive()
+    steps = make_views(make_room(3), drive, bias=BIAS, noise_m=0.03, noise_rad=0.03)
+    walked, smoothed = (errors(track(steps, replace(CONFIG, rounds=rounds)), drive)[0] for rounds in (0, 10))
+    assert smoothed < walked
+
+
+def test_without_motion_depth_will_do() -> None:
+    """A robot that does not tell its motion is found all the same, if it moves little between keyframes."""
+    drive = [SE2(0.0, 0.0, 0.0)]
+    for _ in range(11):
+        drive.append(drive[-1] @ SE2(0.1, 0.0, 0.15))
+    steps = [replace(step, motion=None) for step in make_views(make_room(), drive)]
+    worst_m, worst_deg = errors(track(steps), drive)
+    assert worst_m < 0.03
+    assert worst_deg < 1.0
+
+
+def test_a_blind_keyframe_is_expected_where_motion_leads() -> None:
+    """No picture, or one without depth: the pose is told and called inertial, and the next ones are found again."""
+    drive = make_drive(14)
+    steps = make_views(make_room(), drive, noise_m=0.01)
+    view = steps[5].view
+    assert view is not None
+    steps[5] = replace(steps[5], view=None)
+    steps[6] = replace(steps[6], view=replace(view, depth_m=np.zeros_like(view.depth_m)))
+    found = track(steps)
+    assert [found[i].source for i in (4, 5, 6, 7)] == ["visual", "inertial", "inertial", "visual"]
+    assert errors(found, drive)[0] < 0.06
+
+
+def test_neither_motion_nor_picture_is_no_pose() -> None:
+    """And what comes after is no crash."""
+    drive = make_drive(8)
+    steps = make_views(make_room(), drive)
+    steps[3] = replace(steps[3], view=None, motion=None)
+    found = track(steps)
+    assert found[3] == PoseEstimate(None, "none")
+    assert found[4].map_from_robot is not None
+    assert track([]) == []
+    blind = [replace(step, view=None) for step in steps[:3]]
+    assert [one.source for one in track(blind)] == ["start", "inertial", "inertial"]
+
+
+def test_parts_hold_everything() -> None:
+    """A track put away and taken up twice ends with the very numbers of one that was not."""
+    steps = make_views(make_room(), make_drive(9), bias=BIAS, noise_m=0.02, noise_rad=0.02)
+    whole, parts = track(steps), list[bytes]()
+    estimator = SurfelEstimator(CONFIG)
+    for start, stop in ((0, 4), (4, 7), (7, 9)):
+        for step in steps[start:stop]:
+            estimator.step(step)
+        parts.append(estimator.part())
+        estimator = SurfelEstimator(CONFIG)
+        estimator.restore(parts)
+    assert estimator.finish() == whole
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+def make_context(folder: Path, shard_frames: int) -> MemoryContext:
+    """Seven keyframes of the room, with observations of another world; it does not matter which."""
+    steps = make_views(make_room(), make_drive(7), noise_m=0.01)
+    observed = [
+        replace(step, observation=make_world().observe(pose)) for step, pose in zip(steps, make_walk(7), strict=True)
+    ]
+    folder.mkdir()
+    inputs = write_inputs(folder, observed)
+    write_table(folder / "frames.parquet", FRAMES, frame_rows(steps))
+    inputs[FRAMES.name] = TableFiles(FRAMES, [folder / "frames.parquet"])
+    config = LocalizeConfig(estimators=("surfel",), shard_frames=shard_frames, snapshot_every=3)
+    return MemoryContext(folder / "out", inputs, config, "surfel")
+
+
+def frame_rows(steps: list[Step]) -> dict[str, list[object]]:
+    views = [step.view for step in steps if step.view]
+    common = {"width": 160, "height": 120, "log_time_nanos": 0, "depth_offset_nanos": 0, "camera_height_m": 0.5}
+    common |= {"fx": 80.0, "fy": 80.0, "cx": 79.5, "cy": 59.5, "roll_rad": 0.0, "pitch_rad": 0.0}
+    rows: dict[str, list[object]] = {name: [value] * len(steps) for name, value in common.items()}
+    rows |= {"level_source": ["tf"] * len(steps), "height_source": ["tf"] * len(steps)}
+    rows |= {"robot_from_camera": [ROBOT_FROM_CAMERA.ravel().tolist()] * len(steps)}
+    rows |= {"frame": [step.frame for step in steps], "stamp_nanos": [step.stamp_nanos for step in steps]}
+    pictures = {"colour": [encode_colour(view.rgb) for view in views]}
+    return {**rows, **pictures, "depth": [encode_depth(view.depth_m) for view in views]}
+
+
+def test_the_stage_tells_all_at_the_end(tmp_path: Path) -> None:
+    """All rows lie in the last shard, in the order of the keyframes, with the map along them."""
+    context = make_context(tmp_path / "a", shard_frames=3)
+    localize.run(context)
+    tables = context.results(POSES, SNAPSHOTS, CELLS)
+    poses = tables["poses"].read()
+    assert poses["frame"] == list(range(7))
+    assert poses["source"] == ["start", *["visual"] * 6]
+    assert tables["snapshots"].read()["frame"] == [2, 5, 6]
+    assert tables["cells"].rows > 100
+    assert tables["poses"].meta["estimator"] == "surfel"
+    rows = [TableFiles(POSES, [tmp_path / "a" / "out" / f"shard-{index}" / "poses.parquet"]).rows for index in range(3)]
+    assert rows == [0, 0, 7]
+    assert context.done[-1][0] == context.done[-1][1]
+    assert context.shards[-1].counters == {"poses_start": 1, "poses_visual": 6}
+
+
+def test_a_run_that_was_cut_goes_on_with_the_same_bytes(tmp_path: Path) -> None:
+    """From any finished shard."""
+    whole = make_context(tmp_path / "whole", shard_frames=3)
+    localize.run(whole)
+    for finished in (1, 2):
+        cut = make_context(tmp_path / f"cut{finished}", shard_frames=3)
+        shards = [tmp_path / "whole" / "out" / f"shard-{index}" for index in range(finished)]
+        cut.finished = tuple(FinishedShard(index, {}, {}, folder) for index, folder in enumerate(shards))
+        localize.run(cut)
+        for index in range(finished, 3):
+            ours, theirs = (tmp_path / name / "out" / f"shard-{index}" for name in (f"cut{finished}", "whole"))
+            assert {p.name: p.read_bytes() for p in ours.iterdir()} == {
+                p.name: p.read_bytes() for p in theirs.iterdir()
+            }
