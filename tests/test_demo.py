@@ -109,7 +109,10 @@ def test_a_package_without_its_files_says_so(monkeypatch: pytest.MonkeyPatch, tm
     assert "pip install" in caught.value.hint
 
 
-@pytest.mark.parametrize("role", ["detector", "segmenter_encoder", "map_update"])
+PAPER_NETWORKS = ("map_update", "mapnet", "deepvo")
+
+
+@pytest.mark.parametrize("role", ["detector", "segmenter_encoder", *PAPER_NETWORKS])
 def test_shipped_models_have_cards_that_tell_the_truth(role: str) -> None:
     """A card names the digest of its file, and how to make it again."""
     path = _shipped(role)
@@ -142,7 +145,8 @@ def test_the_shipped_map_update_fits_what_comes_out_of_the_box() -> None:
 
 
 def test_all_shipped_models_together_are_small() -> None:
-    """Twelve megabytes at most."""
+    """Twelve megabytes at most; three of them those of the paper."""
+    assert sum(_shipped(role).stat().st_size for role in PAPER_NETWORKS) <= 3_000_000
     files = list(builtin.FOLDER.glob("*.onnx"))
     assert len(files) >= 3
     assert sum(path.stat().st_size for path in files) <= 12_000_000
