@@ -93,6 +93,14 @@ def test_edges_and_holes_make_no_surfels() -> None:
     assert len(surfels_of(replace(view, depth_m=np.zeros_like(view.depth_m)), 100, 6.0)) == 0
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (3, 2), (5, 7)])
+def test_a_tiny_picture_is_no_trouble(shape: tuple[int, int]) -> None:
+    """It shows next to nothing."""
+    view = replace(plane_view((0.0, 0.0, 1.0), 2.0, 0.0), depth_m=np.full(shape, 2.0, np.float32))
+    assert len(Keyframe.of(view, CONFIG).surfels) <= shape[0] * shape[1]
+    assert agreement(Sight.of(view, 6.0), Sight.of(view, 6.0), np.eye(4)).mean in (0.0, 3.0)
+
+
 def test_rare_directions_are_kept() -> None:
     """Of a floor and a few small faces the faces lose least."""
     view = make_room().view(np.eye(4))
@@ -213,6 +221,26 @@ def test_a_blind_keyframe_is_expected_where_motion_leads() -> None:
     found = track(steps)
     assert [found[i].source for i in (4, 5, 6, 7)] == ["visual", "inertial", "inertial", "visual"]
     assert errors(found, drive)[0] < 0.06
+
+
+def test_odometry_that_is_set_anew_is_not_believed() -> None:
+    """A step of a kilometre in a second is no motion; nor is the turn that came with it."""
+    drive = make_drive(8)
+    steps = make_views(make_room(), drive)
+    steps[4] = replace(steps[4], motion=SE2(1000.0, 0.0, 2.0))
+    assert errors(track(steps), drive)[0] < 0.03
+
+
+def test_a_place_without_overlap_begins_anew() -> None:
+    """Keyframes of another room are tied to each other and called inertial, and the first room is known again."""
+    here, there = make_room(), make_room(7)
+    drive = make_drive(12)
+    steps = make_views(here, drive, noise_m=0.01)
+    for index in (5, 6, 7):
+        steps[index] = replace(steps[index], view=there.view(matrix(drive[index])))
+    found = track(steps)
+    assert [found[index].source for index in (4, 8, 11)] == ["visual"] * 3
+    assert errors(found[:5] + found[8:], drive[:5] + drive[8:])[0] < 0.03
 
 
 def test_neither_motion_nor_picture_is_no_pose() -> None:

@@ -17,7 +17,7 @@ from semslam.slam.estimator import INERTIAL, NONE, START, VISUAL, PoseEstimate, 
 from semslam.slam.surfel.sight import Sight
 from semslam.slam.surfel.smoothing import smooth
 from semslam.slam.surfel.surfels import Surfels
-from semslam.slam.surfel.tracking import Keyframe, Place, Track, voxels_of
+from semslam.slam.surfel.tracking import Keyframe, Place, Track, placed
 from semslam.stages.settings import SurfelConfig
 
 _Arrays = dict[str, NDArray[Any]]
@@ -54,7 +54,8 @@ class SurfelEstimator:
         new = range(self._kept, len(self._stamps))
         self._kept = len(self._stamps)
         prior = self._track.prior
-        arrays: _Arrays = {"bias": prior.bias, "covariance": prior.covariance, "open": self._track.open}
+        arrays: _Arrays = {"bias": prior.bias, "covariance": prior.covariance, "speed": prior.speed}
+        arrays["open"] = self._track.open
         arrays["stamps"] = np.array([self._stamps[index] for index in new], np.int64)
         return pack(arrays | {str(index): as_array(_packed(self._track.places[index])) for index in new})
 
@@ -63,7 +64,8 @@ class SurfelEstimator:
         self._track, self._stamps = Track(self._config), []
         for part in parts:
             arrays = unpack(part)
-            self._track.prior.bias, self._track.prior.covariance = arrays["bias"], arrays["covariance"]
+            prior = self._track.prior
+            prior.bias, prior.covariance, prior.speed = arrays["bias"], arrays["covariance"], arrays["speed"]
             self._track.open = arrays["open"]
             for stamp in arrays["stamps"].tolist():
                 self._track.places.append(_unpacked(arrays[str(len(self._stamps))].tobytes()))
@@ -100,12 +102,5 @@ def _unpacked(packed: bytes) -> Place:
     if "points" in arrays:
         surfels = Surfels(*(arrays[name].astype(np.float64) for name in ("points", "normals", "sigma_m")))
         keyframe = Keyframe(surfels, Sight.from_arrays(arrays))
-    pose, motion = arrays["pose"], arrays["motion"].tolist()
-    return Place(
-        keyframe,
-        pose,
-        arrays["seconds"].item(),
-        SE2(*motion) if motion else None,
-        arrays["linked"].item(),
-        voxels_of(keyframe, pose),
-    )
+    motion = SE2(*arrays["motion"].tolist()) if arrays["motion"].size else None
+    return placed(keyframe, arrays["pose"], arrays["seconds"].item(), motion, linked=arrays["linked"].item())

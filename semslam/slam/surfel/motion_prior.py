@@ -40,6 +40,8 @@ class MotionPrior:
     bias: Floats = field(default_factory=lambda: np.zeros(3))
     """(3,) m/s, m/s and rad/s by which measured motion is too large."""
     covariance: Floats = field(default_factory=lambda: np.zeros((3, 3)))
+    speed: Floats = field(default_factory=lambda: np.zeros(3))
+    """(3,) m/s, m/s and rad/s of the last step that was seen; a robot that tells no motion is thought to go on so."""
 
     def __post_init__(self) -> None:
         self.covariance = np.diag(np.square(bias_sigmas(self.config)))
@@ -47,11 +49,16 @@ class MotionPrior:
     def expect(self, motion: SE2 | None, seconds: float) -> Expected:
         """The true motion of a step for which this was measured."""
         if motion is None:
-            speed, turn = UNKNOWN_SPEED_M_S * seconds, UNKNOWN_TURN_RAD_S * seconds
-            return Expected(SE2(0.0, 0.0, 0.0), np.diag([speed**2, speed**2, turn**2]))
+            x, y, heading = self.speed * seconds
+            away, turn = UNKNOWN_SPEED_M_S * seconds, UNKNOWN_TURN_RAD_S * seconds
+            return Expected(SE2(x, y, wrap_angle(heading)), np.diag([away**2, away**2, turn**2]))
         x, y, heading = np.array([motion.x_m, motion.y_m, motion.heading_rad]) - self.bias * seconds
         random = np.diag(np.square(noise_sigmas(self.config))) * seconds
         return Expected(SE2(x, y, wrap_angle(heading)), random + seconds**2 * self.covariance)
+
+    def see(self, seen: SE2, seconds: float) -> None:
+        """Keep how fast the robot went."""
+        self.speed = np.array([seen.x_m, seen.y_m, seen.heading_rad]) / seconds if seconds > 0 else np.zeros(3)
 
     def learn(self, motion: SE2, seconds: float, seen: SE2, covariance: Floats) -> None:
         """Compare measured motion with what was seen of it; `covariance` (3, 3) is that of `seen`."""

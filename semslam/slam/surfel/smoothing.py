@@ -9,7 +9,7 @@ keyframe that later ones hardly saw is still held by those that did.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from semslam.geometry.frames import Matrix
 from semslam.slam.surfel.alignment import between, change_between, nudged, rotation_vector
 from semslam.slam.surfel.motion_prior import UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S, bias_sigmas, noise_sigmas
 from semslam.slam.surfel.sight import agreement
-from semslam.slam.surfel.tracking import Keyframe, Place, unlevel, voxels_of
+from semslam.slam.surfel.tracking import Keyframe, Place, moved, shared_voxels, unlevel
 from semslam.stages.settings import SurfelConfig
 
 Floats = NDArray[np.float64]
@@ -83,45 +83,22 @@ def _round(before: Smoothed, reach_m: float, config: SurfelConfig) -> Smoothed:
             _move(equations, places, index, before.bias, config)
     equations.add((equations.bias,), np.diag(1.0 / bias_sigmas(config) ** 2), before.bias / bias_sigmas(config) ** 2)
     changes = equations.solved()
-    moved = [nudged(place.pose, change) for place, change in zip(places, changes[:-1], strict=True)]
-    after = [
-        replace(place, pose=pose, voxels=voxels_of(place.keyframe, pose))
-        for place, pose in zip(places, moved, strict=True)
-    ]
+    after = [moved(place, nudged(place.pose, change)) for place, change in zip(places, changes[:-1], strict=True)]
     return Smoothed(after, before.bias + changes[-1], tied)
 
 
 def pairs_of(places: Sequence[Place], most: int) -> list[tuple[int, int]]:
     """Keyframes that see the same: of each those, at most so many, with which it shares most voxels; and neighbours."""
-    shared = _shared_voxels([place.voxels for place in places])
     found = {(index, index + 1) for index in range(len(places) - 1)}
-    for index, others in enumerate(shared):
-        sizes = {other: count for other, count in others.items() if _enough(places, index, other, count)}
+    for index, place in enumerate(places):
+        sizes = {
+            other: count
+            for other, count in shared_voxels(places, place).items()
+            if other != index and count >= _LEAST_SHARED * min(len(place.voxels), len(places[other].voxels))
+        }
         for other in sorted(sizes, key=lambda one: (-sizes[one], one))[:most]:
             found.add((min(index, other), max(index, other)))
-    pictured = [place.keyframe is not None for place in places]
-    return [(first, second) for first, second in sorted(found) if pictured[first] and pictured[second]]
-
-
-def _enough(places: Sequence[Place], first: int, second: int, shared: int) -> bool:
-    return shared >= _LEAST_SHARED * min(len(places[first].voxels), len(places[second].voxels))
-
-
-def _shared_voxels(voxels: Sequence[NDArray[np.int64]]) -> list[dict[int, int]]:
-    """Of each keyframe, how many voxels it shares with which others."""
-    owner = np.repeat(np.arange(len(voxels)), [len(one) for one in voxels])
-    numbers = np.concatenate([*voxels, np.zeros(0, np.int64)])
-    order = np.argsort(numbers, kind="stable")
-    owner, numbers = owner[order], numbers[order]
-    ends = np.flatnonzero(numbers[1:] != numbers[:-1]) + 1
-    shared: list[dict[int, int]] = [{} for _ in voxels]
-    for group in np.split(owner, ends):
-        for first in group.tolist():
-            counts = shared[first]
-            for second in group.tolist():
-                if first != second:
-                    counts[second] = counts.get(second, 0) + 1
-    return shared
+    return sorted(found)
 
 
 def _tie(equations: _Equations, places: Sequence[Place], first: int, second: int, reach_m: float) -> bool:

@@ -73,6 +73,8 @@ class Surfels:
 
 def surfels_of(view: View, most: int, max_depth_m: float) -> Surfels:
     """At most `most` surfels of a picture, in the robot frame, spread over directions; values exact in float32."""
+    if min(view.depth_m.shape) < block_size(view.depth_m.shape[1]):
+        return Surfels(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     planes = _fitted(view, max_depth_m)
     chosen = _spread(planes, most)
     points, normals, sigma_m = (

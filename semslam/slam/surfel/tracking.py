@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from semslam.geometry.frames import SE2, Matrix, planar
 from semslam.slam.estimator import View
+from semslam.slam.health import JUMP_M, JUMP_M_PER_S
 from semslam.slam.surfel.alignment import Fit, Target, between, change_between, nudged
-from semslam.slam.surfel.motion_prior import MotionPrior
+from semslam.slam.surfel.motion_prior import Expected, MotionPrior
 from semslam.slam.surfel.sight import Agreement, Sight, agreement
 from semslam.slam.surfel.surfels import Surfels, surfels_of
 from semslam.stages.settings import SurfelConfig
@@ -27,6 +28,8 @@ Floats = NDArray[np.float64]
 
 VOXEL_M = 0.25
 """Keyframes that have surfels in the same voxels see the same."""
+_COMPARED = 60
+"""Keyframes whose voxels are compared: those whose surfels lie nearest."""
 _COARSE = 3
 """Every third surfel will do for a first look."""
 _FIRST_REACH_M, _REACH_M, _SHRINK = 0.3, 0.1, 0.7
@@ -37,12 +40,16 @@ _HEADING_STEP_RAD = math.radians(1.0)
 _MOST_STARTS = 25
 _OPEN_SIGMAS = 2.5
 _STARTS_KEPT = 2
+"""Of the headings tried so many, or a quarter, are looked at closely."""
 _BESIDE_M = (-0.1, -0.05, 0.05, 0.1)
 _TIMES_BESIDE = 3
 _REFERENCES = 3
 """Keyframes with whose pictures a pose must agree."""
 _WORTH = 300.0
 """Independent samples of a picture: what a difference of one standard deviation everywhere weighs against motion."""
+_NEUTRAL = 0.9
+"""What a sample counts that is not found again, in standard deviations: worse than one that is there, better than one
+that is not. So a pose from which little is seen of what is known must be all the more likely by motion."""
 _TOO_FEW = 0.04
 """Share of samples that must be found again, or the pictures have nothing in common."""
 _MIN_MATCHES = 40
@@ -88,6 +95,21 @@ class Place:
     """Whether the pose was seen, not only expected."""
     voxels: NDArray[np.int64]
     """Those with surfels, rising."""
+    middle: Floats
+    """(3,) of its surfels, in the map frame; NaN without any."""
+
+
+def placed(keyframe: Keyframe | None, pose: Matrix, seconds: float, motion: SE2 | None, *, linked: bool) -> Place:
+    """A keyframe put somewhere."""
+    if keyframe is None or not len(keyframe.surfels):
+        return Place(keyframe, pose, seconds, motion, linked, np.zeros(0, np.int64), np.full(3, np.nan))
+    points = keyframe.surfels.moved(pose).points
+    return Place(keyframe, pose, seconds, motion, linked, _voxels(points), points.mean(0))
+
+
+def moved(place: Place, pose: Matrix) -> Place:
+    """The same keyframe somewhere else."""
+    return placed(place.keyframe, pose, place.seconds, place.motion, linked=place.linked)
 
 
 class Track:
@@ -108,41 +130,67 @@ class Track:
         if not self.places:
             return self._remember(keyframe, np.eye(4), 0.0, None, linked=True)
         before = self.places[-1]
+        if motion is not None and math.hypot(motion.x_m, motion.y_m) > max(JUMP_M, JUMP_M_PER_S * seconds):
+            motion = None  # odometry that was set anew, not a robot
         expected = self.prior.expect(motion, seconds)
         start = before.pose @ matrix_of(expected.motion)
-        covariance = self.open + expected.covariance
-        found = self._find(keyframe, start, covariance) if keyframe else None
+        whole = self.open + expected.covariance
+        found = self._find(keyframe, start, whole, linked=True)
         if found is None:
-            self.open = covariance
-            return self._remember(keyframe, start, seconds, motion, linked=False)
+            return self._go_on(keyframe, start, seconds, motion, expected)
         self.open = np.zeros((3, 3))
         pose, hessian = found
-        if motion is not None and before.linked:
-            seen, unsure = planar(between(before.pose, pose)), _covariance_in_robot(hessian, before.pose)
-            self.prior.learn(motion, seconds, seen, unsure)
+        if before.linked:
+            seen = planar(between(before.pose, pose))
+            self.prior.see(seen, seconds)
+            if motion is not None:
+                self.prior.learn(motion, seconds, seen, _covariance_in_robot(hessian, before.pose))
         return self._remember(keyframe, pose, seconds, motion, linked=True)
+
+    def _go_on(
+        self, keyframe: Keyframe | None, start: Matrix, seconds: float, motion: SE2 | None, expected: Expected
+    ) -> Place:
+        """Without a link to what is known: among keyframes that have none either, or as motion leads."""
+        found = self._find(keyframe, start, expected.covariance, linked=False)
+        if found is None:
+            self.open = self.open + expected.covariance
+        return self._remember(keyframe, start if found is None else found[0], seconds, motion, linked=False)
 
     def _remember(
         self, keyframe: Keyframe | None, pose: Matrix, seconds: float, motion: SE2 | None, *, linked: bool
     ) -> Place:
-        place = Place(keyframe, pose, seconds, motion, linked, voxels_of(keyframe, pose))
+        place = placed(keyframe, pose, seconds, motion, linked=linked)
         self.places.append(place)
         return place
 
-    def _find(self, keyframe: Keyframe, start: Matrix, covariance: Floats) -> tuple[Matrix, Floats] | None:
-        """Pose and Hessian (6, 6) of the surfaces alone; None if what was seen before does not show it."""
-        near = self._near(voxels_of(keyframe, start))
-        parts = [(place.keyframe, place.pose) for place in near if place.keyframe]
-        if not parts:
+    def _find(
+        self, keyframe: Keyframe | None, start: Matrix, covariance: Floats, *, linked: bool
+    ) -> tuple[Matrix, Floats] | None:
+        """Pose and Hessian (6, 6) of the surfaces alone; None if none of what was seen before, linked or not, fits."""
+        if keyframe is None:
             return None
-        return Search(keyframe, parts, start, covariance, self._config).result()
+        near = self._near(placed(keyframe, start, 0.0, None, linked=False), linked=linked)
+        parts = [(place.keyframe, place.pose) for place in near if place.keyframe]
+        return Search(keyframe, parts, start, covariance, self._config).result() if parts else None
 
-    def _near(self, voxels: NDArray[np.int64]) -> list[Place]:
-        """The places that see most of the same, and the last, best first."""
-        shared = [len(np.intersect1d(voxels, place.voxels, assume_unique=True)) for place in self.places]
-        shared[-1] = len(voxels) + 1
-        order = np.argsort(-np.array(shared), kind="stable")[: self._config.neighbours]
-        return [self.places[i] for i in order if shared[i]]
+    def _near(self, place: Place, *, linked: bool) -> list[Place]:
+        """The last place and those that see most of the same, best first, of those that are linked or not."""
+        shared = shared_voxels(self.places, place)
+        last = len(self.places) - 1
+        shared[last] = len(place.voxels) + 1
+        others = [index for index in shared if self.places[index].linked == linked]
+        others.sort(key=lambda index: (-shared[index], index))
+        return [self.places[index] for index in others[: self._config.neighbours]]
+
+
+def shared_voxels(places: Sequence[Place], place: Place) -> dict[int, int]:
+    """How many voxels a place shares with others, by their number; only with those whose middles are nearest."""
+    if not len(place.voxels):
+        return {}
+    away = np.linalg.norm(np.array([one.middle for one in places]) - place.middle, axis=1)
+    near = np.argsort(away, kind="stable")[:_COMPARED]  # NaN comes last
+    counts = {int(i): len(np.intersect1d(place.voxels, places[i].voxels, assume_unique=True)) for i in near}
+    return {index: count for index, count in counts.items() if count}
 
 
 class Search:
@@ -158,7 +206,10 @@ class Search:
     ) -> None:
         """`known`: keyframes with their poses, best first; `covariance` (3, 3) of the start's x, y and heading."""
         self._keyframe = keyframe
-        self._known = known
+        self._references = known[:_REFERENCES]
+        views = [keyframe, *(other for other, _ in self._references)]
+        counts = [len(view.sight.points) for view in views]
+        self._samples = counts[0] * (len(counts) - 1) + sum(counts[1:])
         self._start = start
         self._target = Target(Surfels.joined([other.surfels.moved(pose) for other, pose in known]))
         self._sigma_m = math.sqrt(max(covariance[0, 0], covariance[1, 1]))
@@ -181,14 +232,14 @@ class Search:
 
     def _starts(self) -> list[Matrix]:
         """Headings that agree best, none beside another."""
-        half = max(1, math.ceil(_OPEN_SIGMAS * self._sigma_rad / _HEADING_STEP_RAD))
-        step = max(_HEADING_STEP_RAD, 2 * half * _HEADING_STEP_RAD / (_MOST_STARTS - 1))
-        half = math.ceil(half * _HEADING_STEP_RAD / step)
+        open_rad = min(math.pi, max(_HEADING_STEP_RAD, _OPEN_SIGMAS * self._sigma_rad))
+        step = max(_HEADING_STEP_RAD, 2 * open_rad / (_MOST_STARTS - 1))
+        half = math.ceil(open_rad / step)
         turns = range(-half, half + 1)
         costs = {turn: self._cost(self._start @ matrix_of(SE2(0.0, 0.0, turn * step))) for turn in turns}
         kept: list[int] = []
         for turn in sorted(turns, key=lambda one: (costs[one], abs(one))):
-            if len(kept) < _STARTS_KEPT and all(abs(turn - other) > 1 for other in kept):
+            if len(kept) < max(_STARTS_KEPT, len(turns) // 4) and all(abs(turn - other) > 1 for other in kept):
                 kept.append(turn)
         return [self._start @ matrix_of(SE2(0.0, 0.0, turn * step)) for turn in kept]
 
@@ -232,13 +283,14 @@ class Search:
     def _cost(self, pose: Matrix) -> float:
         """Of pictures that disagree and of motion that is unlikely."""
         seen = self._agreement(pose)
-        mean = Agreement(0.0, 0).mean if self._too_few(seen) else seen.mean
+        rest = max(0, self._samples - seen.looked_up)
+        mean = (seen.difference + _NEUTRAL * rest) / max(1, self._samples)
         error = change_between(self._start, pose)
         return _WORTH * mean + 0.5 * float(error @ self._motion @ error)
 
     def _agreement(self, pose: Matrix) -> Agreement:
         whole = Agreement(0.0, 0)
-        for other, place in self._known[:_REFERENCES]:
+        for other, place in self._references:
             whole += agreement(other.sight, self._keyframe.sight, between(place, pose))
         return whole
 
@@ -254,11 +306,9 @@ def matrix_of(pose: SE2) -> Matrix:
     return matrix
 
 
-def voxels_of(keyframe: Keyframe | None, pose: Matrix) -> NDArray[np.int64]:
-    """Voxels in which the keyframe has surfels, numbered, rising."""
-    if keyframe is None:
-        return np.zeros(0, np.int64)
-    cells = np.floor(keyframe.surfels.moved(pose).points / VOXEL_M).astype(np.int64) + (1 << 20)
+def _voxels(points: Floats) -> NDArray[np.int64]:
+    """Voxels in which points (N, 3) lie, numbered, rising."""
+    cells = np.floor(points / VOXEL_M).astype(np.int64) + (1 << 20)
     return np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2])
 
 
