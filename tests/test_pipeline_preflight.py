@@ -154,3 +154,19 @@ def test_a_configuration_that_made_results_is_not_checked_again(files: Path, tmp
     del made["ingest"]
     with pytest.raises(UsageError, match="no ONNX file"):
         check_new(planner, config, tasks, [LogRecord("a", [], {}, made)])
+
+
+def test_a_task_is_keyed_by_its_own_sections_alone(tmp_path: Path) -> None:
+    """A setting that one estimator gains, or is given, makes no other estimator's results stale."""
+
+    def standing(*assignments: str) -> dict[str, dict[str, object]]:
+        config = load_config(STAGES, assignments=["localize.estimators=surfel,paper,dead_reckoning", *assignments])
+        planner = Planner(STAGES, config, tmp_path, EntryIndex(tmp_path), DigestCache(tmp_path / "d.json"), "export")
+        tasks = tasks_of(STAGES, Log("a", ()), config)
+        return {task.variant: planner.standing(task)["config"] for task in tasks if task.stage.name == "localize"}
+
+    before, after = standing(), standing("localize.surfel.rounds=3")
+    assert [name for name in before if before[name] != after[name]] == ["surfel"]
+    assert {"surfel", "mapnet", "deepvo", "orb_rgbd"}.isdisjoint(before["paper"])
+    assert "paper" not in before["surfel"]
+    assert before["dead_reckoning"]["snapshot_every"] == 10

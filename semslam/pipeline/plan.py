@@ -212,12 +212,15 @@ class Planner:
         """The configuration of a task as it goes into the key; the same for all logs."""
         place = (task.stage.name, task.variant)
         if place not in self._settings:
-            self._settings[place] = self._keyed(self.task_config(task), task.stage.name)
+            self._settings[place] = self._keyed(self.task_config(task), task.stage.name, task.variant)
         return self._settings[place]
 
-    def _keyed(self, section: Any, prefix: str) -> dict[str, Any]:
+    def _keyed(self, section: Any, prefix: str, variant: str = "") -> dict[str, Any]:
+        """Plain values of a section; files by their content, and nothing of what other variants alone look at."""
         values: dict[str, Any] = {}
         for item in fields(section):
+            if variant not in item.metadata.get("variants", (variant,)):
+                continue
             value, key = getattr(section, item.name), f"{prefix}.{item.name}"
             if is_dataclass(value):
                 values[item.name] = self._keyed(value, key)

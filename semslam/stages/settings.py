@@ -7,7 +7,7 @@ these, checks the ranges declared with `setting` and prints them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 
@@ -217,6 +217,8 @@ class SurfelConfig:
 
 _PAPER = ("paper", "paper_visual")
 """Estimators that share section `[localize.paper]`."""
+_VARIANTS = "variants"
+"""Of a section that only some variants look at: which. The cache keys of others do not hold it."""
 
 
 @dataclass(frozen=True)
@@ -230,15 +232,15 @@ class LocalizeConfig:
     """Estimators to run; each gives its own track and map. surfel aligns the depth images of the whole log and takes
     motion where they say nothing; paper is visual-inertial, paper_visual visual only; mapnet, deepvo and orb_rgbd look
     at the pictures themselves and never at the motion."""
-    surfel: SurfelConfig = field(default_factory=SurfelConfig)
+    surfel: SurfelConfig = field(default_factory=SurfelConfig, metadata={_VARIANTS: ("surfel",)})
     """Section `[localize.surfel]`."""
-    paper: PaperConfig = field(default_factory=PaperConfig)
+    paper: PaperConfig = field(default_factory=PaperConfig, metadata={_VARIANTS: _PAPER})
     """Section `[localize.paper]`."""
-    mapnet: MapNetConfig = field(default_factory=MapNetConfig)
+    mapnet: MapNetConfig = field(default_factory=MapNetConfig, metadata={_VARIANTS: ("mapnet",)})
     """Section `[localize.mapnet]`."""
-    deepvo: DeepVoConfig = field(default_factory=DeepVoConfig)
+    deepvo: DeepVoConfig = field(default_factory=DeepVoConfig, metadata={_VARIANTS: ("deepvo",)})
     """Section `[localize.deepvo]`."""
-    orb_rgbd: OrbConfig = field(default_factory=OrbConfig)
+    orb_rgbd: OrbConfig = field(default_factory=OrbConfig, metadata={_VARIANTS: ("orb_rgbd",)})
     """Section `[localize.orb_rgbd]`."""
     snapshot_every: int = setting(10, low=1, high=100000)
     """Keyframes between two map snapshots; the last keyframe always has one."""
@@ -254,15 +256,10 @@ class LocalizeConfig:
 
     def for_variant(self, estimator: str) -> LocalizeConfig:
         """The configuration of one estimator alone, so that its cache key ignores the settings of the others."""
-        return replace(
-            self,
-            estimators=(estimator,),
-            surfel=self.surfel if estimator == "surfel" else SurfelConfig(),
-            paper=self.paper if estimator in _PAPER else PaperConfig(),
-            mapnet=self.mapnet if estimator == "mapnet" else MapNetConfig(),
-            deepvo=self.deepvo if estimator == "deepvo" else DeepVoConfig(),
-            orb_rgbd=self.orb_rgbd if estimator == "orb_rgbd" else OrbConfig(),
-        )
+        sections = {item.name: item for item in fields(self) if _VARIANTS in item.metadata}
+        others = [name for name, item in sections.items() if estimator not in item.metadata[_VARIANTS]]
+        plain = {name: type(getattr(self, name))() for name in others}
+        return replace(self, estimators=(estimator,), **plain)
 
 
 @dataclass(frozen=True)
