@@ -248,6 +248,18 @@ def test_a_log_without_keyframes_gives_empty_tables(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+@pytest.mark.parametrize("most", [1, 5, 8, 20])
+def test_only_the_first_keyframes_if_asked(tmp_path: Path, most: int) -> None:
+    """As if the log ended there."""
+    results = []
+    for name, steps, keyframes in (("all", walk_steps(10)[:most], 0), ("some", walk_steps(10), most)):
+        context = make_context(tmp_path / name, steps, "paper", replace(CONFIG, max_keyframes=keyframes))
+        localize.run(context)
+        assert context.done[-1] == (min(most, 10), min(most, 10))
+        results.append(every_byte(context.folder))
+    assert results[0] == results[1]
+
+
 def test_a_motion_that_is_no_number_is_unknown(tmp_path: Path) -> None:
     """NaN in the odometry must not poison the rest of the track."""
     steps = walk_steps(5)

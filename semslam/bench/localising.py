@@ -40,7 +40,11 @@ def settings_of(work: Work, row: Row, protocol: str, seed: int, networks: Networ
     Raises:
         SemslamError: its network could not be trained.
     """
-    settings = {"localize.estimators": [row.estimator], **row.settings}
+    settings = {
+        "localize.estimators": [row.estimator],
+        "localize.max_keyframes": work.request.steps,
+        **row.settings,
+    }
     if row.network:
         outcome = networks[row.network, protocol, "real", seed]
         model = model_of(work, outcome)

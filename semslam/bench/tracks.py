@@ -1,7 +1,7 @@
 """Pose tracks of every row on the logs that test, made by the pipeline and scored against exact truth.
 
-Stages run as ever, in an output folder of the bench, so that tracks are cached under what they depend on. Scores are
-of the first `steps` keyframes of a log: an estimator never looks ahead, so its first poses are those of a shorter log.
+Stages run as ever, in an output folder of the bench, so that tracks are cached under what they depend on. The first
+`steps` keyframes of a log are localised and scored.
 """
 
 from __future__ import annotations

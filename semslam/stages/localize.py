@@ -56,21 +56,22 @@ def run(ctx: StageContext) -> None:
 def _run_stepwise(ctx: StageContext) -> None:
     """Step through all keyframes, shard by shard."""
     motion, observations = ctx.read(MOTION), ctx.read(OBSERVATIONS)
+    rows = _rows_of(motion, ctx.config)
     frames = ctx.read(FRAMES) if ctx.variant in NEEDS_VIEWS else None
     track = _SteppedTrack(ctx, observations.meta)
     keep_freed_memory()
     if ctx.finished:
         track.restore(ctx.finished[-1])
-    for index, start, stop in row_shards(motion.rows, ctx.config.shard_frames):
+    for index, start, stop in row_shards(rows, ctx.config.shard_frames):
         if index < len(ctx.finished):
             continue
         with ctx.shard(index) as shard:
             tables = {table.name: shard.table(table, track.meta) for table in (POSES, SNAPSHOTS, CELLS)}
             steps = _steps(motion, observations, frames, track.shape, start, stop)
             for done, step in enumerate(steps, start + 1):
-                track.add(step, track.estimate(step), shard, tables, last=done == motion.rows)
-                ctx.progress(done, motion.rows)
-            if stop == motion.rows:
+                track.add(step, track.estimate(step), shard, tables, last=done == rows)
+                ctx.progress(done, rows)
+            if stop == rows:
                 track.close(shard, tables)
             shard.path(_STATE).write_bytes(track.state())
 
@@ -79,12 +80,13 @@ def _run_whole(ctx: StageContext) -> None:
     """Take in all keyframes, shard by shard, then tell all poses at once."""
     motion, observations, frames = ctx.read(MOTION), ctx.read(OBSERVATIONS), ctx.read(FRAMES)
     config: LocalizeConfig = ctx.config
+    rows = _rows_of(motion, config)
     estimator = open_whole(ctx.variant, config)
     track = _Track(ctx, observations.meta)
     keep_freed_memory()
     estimator.restore([(shard.folder / _STATE).read_bytes() for shard in ctx.finished])
-    total = motion.rows + config.surfel.rounds
-    for index, start, stop in row_shards(motion.rows, config.shard_frames):
+    total = rows + config.surfel.rounds
+    for index, start, stop in row_shards(rows, config.shard_frames):
         if index < len(ctx.finished):
             continue
         with ctx.shard(index) as shard:
@@ -93,14 +95,19 @@ def _run_whole(ctx: StageContext) -> None:
                 estimator.step(step)
                 ctx.progress(done, total)
             shard.path(_STATE).write_bytes(estimator.part())
-            if stop < motion.rows:
+            if stop < rows:
                 continue
-            poses = estimator.finish(lambda rounds: ctx.progress(motion.rows + rounds, total))
-            steps = _steps(motion, observations, None, track.shape, 0, motion.rows)
+            poses = estimator.finish(lambda rounds: ctx.progress(rows + rounds, total))
+            steps = _steps(motion, observations, None, track.shape, 0, rows)
             for done, (step, pose) in enumerate(zip(steps, poses, strict=True), 1):
-                track.add(step, pose, shard, tables, last=done == motion.rows)
+                track.add(step, pose, shard, tables, last=done == rows)
             track.close(shard, tables)
             ctx.progress(total, total)
+
+
+def _rows_of(motion: TableSource, config: LocalizeConfig) -> int:
+    """How many keyframes to localise."""
+    return min(motion.rows, config.max_keyframes or motion.rows)
 
 
 class _Track:

@@ -242,6 +242,8 @@ class LocalizeConfig:
     """Section `[localize.deepvo]`."""
     orb_rgbd: OrbConfig = field(default_factory=OrbConfig, metadata={_VARIANTS: ("orb_rgbd",)})
     """Section `[localize.orb_rgbd]`."""
+    max_keyframes: int = setting(0, low=0, high=10**9)
+    """Localise only the first so many keyframes of a log; 0 for all."""
     snapshot_every: int = setting(10, low=1, high=100000)
     """Keyframes between two map snapshots; the last keyframe always has one."""
     modes: int = setting(5, low=1, high=100)
