@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semslam.geometry.frames import FLU_FROM_OPTICAL, SE2, Matrix
+from semslam.geometry.grid import Planes
+from semslam.labels import FIRST_OBJECT, FREE_FLOOR, OBSTACLE, UNOBSERVED
 from semslam.slam.estimator import Step, View
+from semslam.slam.surfel.surfels import surfels_of
+from tests.slam_world import CELL_M, CLASSES, SIDE
 
 SECOND = 1_000_000_000
 WIDTH, HEIGHT, FOCAL_PX = 160, 120, 80.0
@@ -86,6 +90,33 @@ def make_views(
         values = np.array([true.x_m + bias.x_m, true.y_m + bias.y_m, true.heading_rad + bias.heading_rad]) + error
         steps.append(Step(frame, frame * SECOND, None, SE2(*values.tolist()), room.view(matrix(now), random)))
     return steps
+
+
+def symmetric(room: Room) -> Room:
+    """The same room with every box again, half a turn about the middle away: it looks the same from both ends."""
+    turn = np.array([-1.0, -1.0, 1.0])
+    turned = room.boxes * turn
+    again = np.stack([turned.min(1), turned.max(1)], 1)
+    return Room(room.lower, room.upper, np.concatenate([room.boxes, again]))
+
+
+def observed(steps: Sequence[Step]) -> list[Step]:
+    """The steps with observations: free floor, and chairs where something stands that is half a metre high or less."""
+    return [replace(step, observation=_observation(step.view)) for step in steps]
+
+
+def _observation(view: View | None) -> Planes:
+    planes = np.zeros((len(CLASSES), SIDE, SIDE), np.float32)
+    if view is not None:
+        points = surfels_of(view, 100_000, 6.0).points
+        column, row = np.floor(points[:, :2] / CELL_M + SIDE / 2).astype(int).T
+        inside = (column >= 0) & (column < SIDE) & (row >= 0) & (row < SIDE) & (points[:, 2] < 2.0)
+        column, row, height = column[inside], row[inside], points[inside, 2]
+        for class_id, low, high in ((FREE_FLOOR, -1.0, 0.08), (OBSTACLE, 0.08, 2.0), (FIRST_OBJECT, 0.08, 0.6)):
+            chosen = (height > low) & (height < high)
+            planes[class_id, row[chosen], column[chosen]] = 1.0
+    planes[UNOBSERVED] = ~planes[1:].any(0)
+    return planes
 
 
 def matrix(pose: SE2) -> Matrix:

@@ -10,29 +10,43 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from semslam.errors import SemslamError
 from semslam.geometry.frames import FLU_FROM_OPTICAL, SE2
 from semslam.slam.estimator import PoseEstimate, Step, View
 from semslam.slam.surfel.alignment import Target, change_between, nudged
 from semslam.slam.surfel.estimator import SurfelEstimator
 from semslam.slam.surfel.motion_prior import MotionPrior
+from semslam.slam.surfel.prior import Grid, read_prior
+from semslam.slam.surfel.registration import FOUND, LOST, place_in
+from semslam.slam.surfel.semantic_field import ClassMap, candidates
 from semslam.slam.surfel.sight import Sight, agreement
 from semslam.slam.surfel.surfels import surfels_of
 from semslam.slam.surfel.tracking import Keyframe
 from semslam.stages import localize
 from semslam.stages.contract import FinishedShard
 from semslam.stages.settings import LocalizeConfig, SurfelConfig
-from semslam.tables.parquet import TableFiles, write_table
+from semslam.tables.parquet import TableFiles, TableFileWriter, write_table
 from semslam.tables.pictures import encode_colour, encode_depth
-from semslam.tables.spec import CELLS, FRAMES, POSES, SNAPSHOTS
-from tests.depth_world import ROBOT_FROM_CAMERA, make_drive, make_room, make_views, matrix
-from tests.slam_world import MemoryContext, make_walk, make_world, write_inputs
+from semslam.tables.spec import CELLS, FRAMES, PLACES, POSES, SNAPSHOTS
+from tests.depth_world import (
+    ROBOT_FROM_CAMERA,
+    Room,
+    make_drive,
+    make_room,
+    make_views,
+    matrix,
+    observed,
+    symmetric,
+)
+from tests.slam_world import CELL_M, CLASSES, SIDE, MemoryContext, make_walk, make_world, write_inputs
 
-CONFIG = SurfelConfig()
+CONFIG = SurfelConfig(surfels=600)
+GRID = Grid(CLASSES, CELL_M, SIDE)
 BIAS = SE2(0.02, -0.02, 0.01)
 
 
 def track(steps: list[Step], config: SurfelConfig = CONFIG) -> list[PoseEstimate]:
-    estimator = SurfelEstimator(config)
+    estimator = SurfelEstimator(config, GRID)
     for step in steps:
         estimator.step(step)
     return estimator.finish()
@@ -260,14 +274,117 @@ def test_parts_hold_everything() -> None:
     """A track put away and taken up twice ends with the very numbers of one that was not."""
     steps = make_views(make_room(), make_drive(9), bias=BIAS, noise_m=0.02, noise_rad=0.02)
     whole, parts = track(steps), list[bytes]()
-    estimator = SurfelEstimator(CONFIG)
+    estimator = SurfelEstimator(CONFIG, GRID)
     for start, stop in ((0, 4), (4, 7), (7, 9)):
         for step in steps[start:stop]:
             estimator.step(step)
         parts.append(estimator.part())
-        estimator = SurfelEstimator(CONFIG)
+        estimator = SurfelEstimator(CONFIG, GRID)
         estimator.restore(parts)
     assert estimator.finish() == whole
+
+
+# --- a map made before ------------------------------------------------------------------------------------------------
+
+ELSEWHERE = SE2(0.9, -0.6, 2.2)
+"""Where the second robot starts, in the map frame of the first."""
+
+
+def make_map(folder: Path, room: Room, drive: list[SE2]) -> Path:
+    """The places table of a drive."""
+    estimator = SurfelEstimator(CONFIG, GRID)
+    for step in observed(make_views(room, drive, noise_m=0.01)):
+        estimator.step(step)
+    estimator.finish()
+    path = folder / "places.parquet"
+    file = TableFileWriter(path, PLACES, {"classes": list(CLASSES), "cell_m": CELL_M, "side": SIDE})
+    for row in estimator.rows():
+        file.append(row)
+    file.close()
+    return path
+
+
+def find(path: Path, room: Room, drive: list[SE2]) -> tuple[list[PoseEstimate], list[str]]:
+    """Poses and warnings of another drive in that map."""
+    estimator = SurfelEstimator(replace(CONFIG, prior=str(path)), GRID)
+    for step in observed(make_views(room, drive, noise_m=0.01)):
+        estimator.step(step)
+    return estimator.finish(), list(estimator.warnings())
+
+
+def test_a_log_is_found_in_a_map_made_before(tmp_path: Path) -> None:
+    """Without a first guess, to the centimetre, and its poses are told in that map's frame."""
+    room, drive = make_room(5), make_drive(12)
+    path = make_map(tmp_path, room, drive)
+    second = [ELSEWHERE @ pose for pose in make_drive(9)]
+    found, warnings = find(path, room, second)
+    assert warnings == []
+    assert {one.source for one in found} == {"visual"}
+    for estimate, true in zip(found, second, strict=True):
+        assert estimate.map_from_robot is not None
+        apart = true.between(estimate.map_from_robot)
+        assert math.hypot(apart.x_m, apart.y_m) < 0.03
+        assert abs(apart.heading_rad) < 0.01
+        assert estimate.modes[0].probability > 0.9
+        mode = estimate.map_from_robot.between(estimate.modes[0].map_from_robot)
+        assert max(abs(mode.x_m), abs(mode.y_m), abs(mode.heading_rad)) < 1e-9
+
+
+def test_a_room_that_looks_the_same_from_both_ends_is_ambiguous(tmp_path: Path) -> None:
+    """No pose is told, but both ways the log may lie are."""
+    room = symmetric(make_room(5, boxes=7))
+    path = make_map(tmp_path, room, make_drive(12))
+    second = [ELSEWHERE @ pose for pose in make_drive(9)]
+    found, warnings = find(path, room, second)
+    assert all(one.map_from_robot is None and one.source == "none" for one in found)
+    assert len(warnings) == 1
+    assert "ambiguous" in warnings[0]
+    half_turn = SE2(0.0, 0.0, math.pi)
+    ways = [mode.map_from_robot for mode in found[0].modes[:2]]
+    for true in (second[0], half_turn @ second[0]):
+        apart = [true.between(way) for way in ways]
+        assert min(math.hypot(one.x_m, one.y_m) for one in apart) < 0.05
+
+
+def test_another_room_is_not_found(tmp_path: Path) -> None:
+    """Lost is an answer."""
+    path = make_map(tmp_path, make_room(5), make_drive(12))
+    found, warnings = find(path, make_room(11), make_drive(9))
+    assert all(one.map_from_robot is None for one in found)
+    assert "lost" in warnings[0]
+
+
+def test_a_map_of_other_classes_is_refused(tmp_path: Path) -> None:
+    """With both class lists."""
+    path = make_map(tmp_path, make_room(5), make_drive(2))
+    with pytest.raises(SemslamError, match="other observations") as caught:
+        read_prior(path, replace(GRID, classes=CLASSES[:-1]))
+    assert "same detector" in caught.value.hint
+    with pytest.raises(SemslamError, match="missing"):
+        read_prior(tmp_path / "none.parquet", GRID)
+
+
+def test_a_map_comes_back_from_its_file(tmp_path: Path) -> None:
+    """The same places and the same cells; a log is found in its own map where it is."""
+    room, drive = make_room(5), make_drive(6)
+    prior = read_prior(make_map(tmp_path, room, drive), GRID)
+    assert len(prior.places) == 6
+    assert len(prior.cells.points) > 500
+    placement = place_in(prior, prior)
+    assert placement.verdict == FOUND
+    pose = placement.other_from_own
+    assert pose is not None
+    assert math.hypot(pose.x_m, pose.y_m) < 0.005
+    assert place_in(replace(prior, places=[]), prior).verdict == LOST
+
+
+def test_the_field_of_maps_without_cells_is_empty() -> None:
+    """And maps of other classes are never compared."""
+    none = ClassMap(np.zeros((0, 2)), np.zeros(0, np.int64), CELL_M, CLASSES)
+    some = ClassMap(np.ones((1, 2)), np.ones(1, np.int64), CELL_M, CLASSES)
+    assert candidates(none, some, 3) == candidates(some, none, 3) == []
+    with pytest.raises(ValueError, match="classes"):
+        candidates(some, replace(some, classes=CLASSES[:-1]), 3)
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
@@ -309,6 +426,9 @@ def test_the_stage_tells_all_at_the_end(tmp_path: Path) -> None:
     assert poses["source"] == ["start", *["visual"] * 6]
     assert tables["snapshots"].read()["frame"] == [2, 5, 6]
     assert tables["cells"].rows > 100
+    places = TableFiles(PLACES, [tmp_path / "a" / "out" / f"shard-{index}" / "places.parquet" for index in range(3)])
+    assert places.read(["frame"])["frame"] == list(range(7))
+    assert places.meta["side"] == SIDE
     assert tables["poses"].meta["estimator"] == "surfel"
     rows = [TableFiles(POSES, [tmp_path / "a" / "out" / f"shard-{index}" / "poses.parquet"]).rows for index in range(3)]
     assert rows == [0, 0, 7]

@@ -166,6 +166,7 @@ def _config_options(command: _Command) -> _Command:
             click.option("--segmenter-encoder", type=click.Path(), help="ONNX file of the segmenter's image encoder."),
             click.option("--segmenter-decoder", type=click.Path(), help="ONNX file of the segmenter's mask decoder."),
             click.option("--estimator", "estimators", multiple=True, metavar="NAME", help="Estimator; repeatable."),
+            click.option("--prior", type=click.Path(), help="Map made before: results/LOG/surfel of an output folder."),
         ),
     )
 
@@ -201,7 +202,21 @@ def _settings(given: Mapping[str, Any]) -> dict[str, Any]:
         settings[f"ingest.topics.{role}"] = topic
     if given.get("estimators"):
         settings["localize.estimators"] = list(given["estimators"])
+    if given.get("prior"):
+        settings["localize.surfel.prior"] = _prior(Path(given["prior"]))
+        settings.setdefault("localize.estimators", ["surfel"])
     return settings
+
+
+def _prior(path: Path) -> str:
+    """The file of a map made before: named itself, or the folder of results that holds it."""
+    file = path / "places.parquet" if path.is_dir() else path
+    if not file.is_file():
+        raise UsageError(
+            f"`--prior {path}` is no map made before: there is no `{file.name if path.is_dir() else path}`",
+            hint="make one with `semslam run LOG --estimator surfel --out OUT`, then `--prior OUT/results/LOG/surfel`",
+        )
+    return str(file.resolve())
 
 
 def _run(context: click.Context, until: str, given: Mapping[str, Any]) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from semslam.errors import SemslamError, UsageError
@@ -92,10 +93,13 @@ def _check_localize(config: Config) -> None:
     """Whether the paper's cells can be made from those of extract, and all estimators take their networks."""
     from semslam.slam.paper_estimator import pooling_factor
     from semslam.slam.registry import model_of, open_estimator
+    from semslam.slam.surfel.prior import Grid, open_prior
 
     section, extract = config.of(LOCALIZE), config.of(EXTRACT)
     if any(name.startswith("paper") for name in section.estimators):
         pooling_factor(section.paper, extract.cell_m, extract.side)
+    if "surfel" in section.estimators and section.surfel.prior:
+        open_prior(Path(section.surfel.prior), Grid(_classes(config), extract.cell_m, extract.side))
     for name in section.estimators:
         if model_of(name, section):
             classes = _classes(config) if name.startswith("paper") else ()

@@ -7,9 +7,9 @@ Poses are map_from_robot; the map frame is the robot frame of the first keyframe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,6 +119,12 @@ class WholeLogEstimator(Protocol):
 
     def finish(self, watch: Callable[[int], None] | None = None) -> list[PoseEstimate]:
         """The poses of all keyframes; `watch` hears how many rounds over them are done."""
+
+    def warnings(self) -> Iterator[str]:
+        """What a user should know of the finished track."""
+
+    def rows(self) -> Iterator[dict[str, list[Any]]]:
+        """Rows of the places table (data_spec.md, table 16) of the finished track."""
 
     def part(self) -> bytes:
         """What was taken in since the last part; equal keyframes give equal bytes."""

@@ -41,16 +41,19 @@ def open_estimator(name: str, config: LocalizeConfig, classes: tuple[str, ...], 
     raise SemslamError(f"There is no estimator `{name}` that steps", hint=f"choose from {', '.join(steps)}")
 
 
-def open_whole(name: str, config: LocalizeConfig) -> WholeLogEstimator:
-    """The estimator of whole logs of that name.
+def open_whole(
+    name: str, config: LocalizeConfig, classes: tuple[str, ...], cell_m: float, side: int
+) -> WholeLogEstimator:
+    """The estimator of whole logs of that name, for observations of `side` cells of `cell_m` metres.
 
     Raises:
-        SemslamError: there is none.
+        SemslamError: there is none, or the map made before does not fit the observations.
     """
     if name in WHOLE_LOGS:
         from semslam.slam.surfel.estimator import SurfelEstimator
+        from semslam.slam.surfel.prior import Grid
 
-        return SurfelEstimator(config.surfel)
+        return SurfelEstimator(config.surfel, Grid(classes, cell_m, side))
     raise SemslamError(f"There is no estimator of whole logs `{name}`", hint=f"choose from {', '.join(WHOLE_LOGS)}")
 
 

@@ -2,11 +2,13 @@
 
 Reads   poses          data_spec.md, table 7
         cells          data_spec.md, table 9
+        places         data_spec.md, table 16, of estimators that have one
 Writes  trajectory     data_spec.md, table 10: keyframes with a pose
 Files   map.png        the picture
         map.parquet    the cells table again, as a file that stands alone
         map.yaml, map.pgm   ROS map_server; left out, with a warning, for maps too large for a picture of single cells
         trajectory.tum      seconds x y z qx qy qz qw
+        places.parquet      the places table again, if there is one: a map in which other logs can be found
 """
 
 from __future__ import annotations
@@ -21,8 +23,8 @@ from semslam.slam.picture import MapCells, Path
 from semslam.slam.render import render_map
 from semslam.stages.contract import ShardWriter, StageContext, TableSource
 from semslam.stages.settings import ExportConfig
-from semslam.tables.parquet import write_table
-from semslam.tables.spec import CELLS, POSES, TRAJECTORY
+from semslam.tables.parquet import TableFileWriter, write_table
+from semslam.tables.spec import CELLS, PLACES, POSES, TRAJECTORY
 
 _POSE = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")
 _FILES = 5
@@ -48,7 +50,24 @@ def run(ctx: StageContext) -> None:
         path = Path(*(np.array(track[name], np.float64) for name in ("x_m", "y_m")))
         subtitle = _subtitle(str(cells.meta["estimator"]), path, shown)
         shard.path("map.png").write_bytes(render_map(shown, path, ctx.log, subtitle, config.pixels_per_cell))
+        _write_places(ctx, shard)
         ctx.progress(_FILES, _FILES)
+
+
+def _write_places(ctx: StageContext, shard: ShardWriter) -> None:
+    """places.parquet, row by row: a row is some 50 kB."""
+    try:
+        places = ctx.read(PLACES)
+    except KeyError:
+        return
+    if not places.rows:
+        return
+    file = TableFileWriter(shard.path("places.parquet"), PLACES, dict(places.meta))
+    try:
+        for rows in places.batches(batch_rows=8):
+            file.append(rows)
+    finally:
+        file.close()
 
 
 def _map_cells(rows: Columns, meta: Mapping[str, Any]) -> MapCells:

@@ -6,6 +6,7 @@ Reads   frames         data_spec.md, table 2, if the estimator looks at pictures
 Writes  poses          data_spec.md, table 7
         snapshots      data_spec.md, table 8: the estimator's own map, or the map of cells so far if it keeps none
         cells          data_spec.md, table 9: the map of the whole log, in the last shard
+        places         data_spec.md, table 16: what `surfel` knows of each keyframe, likewise; of others none
 Paper   equations 2 to 8 and 10
 
 A step needs all steps before it. Each shard therefore keeps the state after its last keyframe (`state.npz`), and a run
@@ -36,7 +37,7 @@ from semslam.slam.registry import NEEDS_VIEWS, WHOLE_LOGS, WITHOUT_MOTION, open_
 from semslam.slam.views import view_of
 from semslam.stages.contract import FinishedShard, ShardWriter, StageContext, TableSink, TableSource, row_shards
 from semslam.stages.settings import LocalizeConfig
-from semslam.tables.spec import CELLS, FRAMES, MOTION, OBSERVATIONS, POSES, SNAPSHOTS
+from semslam.tables.spec import CELLS, FRAMES, MOTION, OBSERVATIONS, PLACES, POSES, SNAPSHOTS
 
 _STATE = "state.npz"
 _VIEW = ["frame", "colour", "depth", "fx", "fy", "cx", "cy", "robot_from_camera"]
@@ -81,8 +82,8 @@ def _run_whole(ctx: StageContext) -> None:
     motion, observations, frames = ctx.read(MOTION), ctx.read(OBSERVATIONS), ctx.read(FRAMES)
     config: LocalizeConfig = ctx.config
     rows = _rows_of(motion, config)
-    estimator = open_whole(ctx.variant, config)
     track = _Track(ctx, observations.meta)
+    estimator = open_whole(ctx.variant, config, *track.grid)
     keep_freed_memory()
     estimator.restore([(shard.folder / _STATE).read_bytes() for shard in ctx.finished])
     total = rows + config.surfel.rounds
@@ -91,6 +92,7 @@ def _run_whole(ctx: StageContext) -> None:
             continue
         with ctx.shard(index) as shard:
             tables = {table.name: shard.table(table, track.meta) for table in (POSES, SNAPSHOTS, CELLS)}
+            places = shard.table(PLACES, {**track.meta, "side": track.grid[2]})
             for done, step in enumerate(_steps(motion, observations, frames, track.shape, start, stop), start + 1):
                 estimator.step(step)
                 ctx.progress(done, total)
@@ -102,6 +104,10 @@ def _run_whole(ctx: StageContext) -> None:
             for done, (step, pose) in enumerate(zip(steps, poses, strict=True), 1):
                 track.add(step, pose, shard, tables, last=done == rows)
             track.close(shard, tables)
+            for row in estimator.rows():
+                places.append(row)
+            for warning in estimator.warnings():
+                shard.warn(warning)
             ctx.progress(total, total)
 
 
@@ -124,6 +130,11 @@ class _Track:
         self._health = TrackHealth(ctx.variant not in WITHOUT_MOTION)
         self._outside = self._unmapped = 0
         self.meta = {"classes": list(self._classes), "cell_m": self._cell_m, "estimator": ctx.variant}
+
+    @property
+    def grid(self) -> tuple[tuple[str, ...], float, int]:
+        """Classes, cell and side of an observation."""
+        return self._classes, self._cell_m, self._side
 
     @property
     def shape(self) -> tuple[int, int, int]:

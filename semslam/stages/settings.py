@@ -211,6 +211,8 @@ class SurfelConfig:
     height_noise_m: float = setting(0.3, low=1e-6, high=100.0)
     """How far above or below the floor that ingest tells a keyframe may be found (1 sigma), metres: for hand-held
     cameras whose height is only known where they see the floor."""
+    prior: str = setting("", file=True)
+    """places.parquet of a map made before, in which logs are to be found without a first guess; empty for none."""
     rounds: int = setting(10, low=0, high=100)
     """Times, at most, that all keyframes are aligned with each other at the end; 0 keeps the track as it was walked."""
 

@@ -381,7 +381,34 @@ VIEWS = Table(
     ),
 )
 
+PLACES = Table(
+    "places",
+    16,
+    "localize",
+    (
+        _FRAME,
+        _STAMP,
+        _c("map_from_robot", "list<float64>", "m", "4x4 matrix, row by row: levelled robot frame to map frame"),
+        _c("points", "list<float32>", "m", "x, y, z of each surfel in the robot frame, one after the other"),
+        _c("normals", "list<float32>", "", "unit normals of the surfels, towards the camera, likewise"),
+        _c("sigma_m", "list<float32>", "m", "standard deviation of each surfel's place along its normal"),
+        _c("depth", "binary", "mm", "16-bit PNG file: the thinned depth image; 0 where missing or too far"),
+        _c("fx", "float64", "px", "focal length of the thinned image along columns"),
+        _c("fy", "float64", "px", "focal length along rows"),
+        _c("cx", "float64", "px", "principal point, column; the centre of the first pixel is 0"),
+        _c("cy", "float64", "px", "principal point, row"),
+        _c(
+            "robot_from_camera",
+            "list<float64>",
+            "m",
+            "4x4 matrix, row by row: optical camera frame to levelled robot frame",
+        ),
+        _c("cells", "list<uint32>", "", "the keyframe's observation, as in table 6; empty without one"),
+        _c("weights", "list<float32>", "", "value of each entry, likewise"),
+    ),
+)
+
 ALL_TABLES: tuple[Table, ...] = (
     TOPICS, FRAMES, MOTION, TRUTH, DETECTIONS, OBSERVATIONS, POSES, SNAPSHOTS, CELLS, TRAJECTORY, EVALUATION,
-    SPLITS, TRUE_MAP, HOME_OBJECTS, VIEWS,
+    SPLITS, TRUE_MAP, HOME_OBJECTS, VIEWS, PLACES,
 )  # fmt: skip

@@ -1,24 +1,31 @@
-"""The estimator of whole logs: walk through all keyframes, then align all of them with each other.
+"""The estimator of whole logs: walk through all keyframes, align all of them with each other, and, if there is a map
+made before, find them in it.
 
 Nothing is told of a keyframe before the last one was taken, since the last one may move the first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.geometry.frames import SE2, planar
+from semslam.geometry.frames import SE2, invert, planar
 from semslam.slam.checkpoint import as_array, pack, unpack
-from semslam.slam.estimator import INERTIAL, NONE, START, VISUAL, PoseEstimate, Step
+from semslam.slam.estimator import INERTIAL, NONE, START, VISUAL, Mode, PoseEstimate, Step
+from semslam.slam.surfel.prior import Grid, Seen, place_row, read_prior, submap_of
+from semslam.slam.surfel.registration import AMBIGUOUS, Placement, place_in
 from semslam.slam.surfel.sight import Sight
 from semslam.slam.surfel.smoothing import smooth
 from semslam.slam.surfel.surfels import Surfels
-from semslam.slam.surfel.tracking import Keyframe, Place, Track, placed
+from semslam.slam.surfel.tracking import Keyframe, Place, Track, matrix_of, moved, placed
 from semslam.stages.settings import SurfelConfig
+
+_MODES = 3
+"""Ways to lie on a map made before that are told, at most."""
 
 _Arrays = dict[str, NDArray[Any]]
 
@@ -26,28 +33,81 @@ _Arrays = dict[str, NDArray[Any]]
 class SurfelEstimator:
     """A pose track from depth, with motion where depth says nothing."""
 
-    def __init__(self, config: SurfelConfig) -> None:
+    def __init__(self, config: SurfelConfig, grid: Grid) -> None:
+        """`grid` of the observations.
+
+        Raises:
+            SemslamError: the map made before cannot be read, or was made of other observations.
+        """
         self._config = config
+        self._grid = grid
+        self._prior = read_prior(Path(config.prior), grid) if config.prior else None
         self._track = Track(config)
+        self._frames: list[int] = []
         self._stamps: list[int] = []
+        self._seen: list[Seen] = []
         self._kept = 0  # keyframes that earlier parts hold
+        self._places: list[Place] = []
+        self._placement: Placement | None = None
 
     def step(self, step: Step) -> None:
         """Take the next keyframe."""
         seconds = (step.stamp_nanos - self._stamps[-1]) / 1e9 if self._stamps else 0.0
         keyframe = Keyframe.of(step.view, self._config) if step.view else None
         self._track.step(keyframe, step.motion, max(0.0, seconds))
+        self._frames.append(step.frame)
         self._stamps.append(step.stamp_nanos)
+        self._seen.append(Seen.of(step.observation))
 
     def finish(self, watch: Callable[[int], None] | None = None) -> list[PoseEstimate]:
         """The poses of all keyframes; `watch` hears of each round over them."""
         if not self._track.places:
             return []
         smoothed = smooth(self._track.places, self._track.prior.bias, self._config, watch)
-        first = planar(smoothed.places[0].pose)  # of its tilt nothing: what is upright all keyframes tell together
-        rest = zip(smoothed.places[1:], smoothed.tied[1:], strict=True)
-        poses = [_estimate(place, first.between(planar(place.pose)), tied=tied) for place, tied in rest]
-        return [PoseEstimate(SE2(0.0, 0.0, 0.0), START), *poses]
+        # Of the first one's tilt nothing: what is upright all keyframes tell together.
+        start = invert(matrix_of(planar(smoothed.places[0].pose)))
+        self._places = [moved(place, start @ place.pose) for place in smoothed.places]
+        sources = [_source(place, tied=tied) for place, tied in zip(self._places, smoothed.tied, strict=True)]
+        if self._prior is None:
+            poses = [_told(place, source) for place, source in zip(self._places[1:], sources[1:], strict=True)]
+            return [PoseEstimate(SE2(0.0, 0.0, 0.0), START), *poses]
+        self._placement = place_in(submap_of(self._places, self._seen, self._grid), self._prior)
+        return self._laid(self._placement, sources)
+
+    def _laid(self, placement: Placement, sources: Sequence[str]) -> list[PoseEstimate]:
+        """The poses in the map made before; none, only modes, if that is not sure."""
+        ways = [(way.other_from_own, way.probability) for way in placement.proposals[:_MODES]]
+        modes = [
+            tuple(Mode(way @ planar(place.pose), probability) for way, probability in ways) for place in self._places
+        ]
+        found = placement.other_from_own
+        if found is None:
+            return [PoseEstimate(None, NONE, modes=some) for some in modes]
+        self._places = [moved(place, matrix_of(found) @ place.pose) for place in self._places]
+        told = [_told(place, source) for place, source in zip(self._places, sources, strict=True)]
+        return [PoseEstimate(one.map_from_robot, one.source, modes=some) for one, some in zip(told, modes, strict=True)]
+
+    def warnings(self) -> Iterator[str]:
+        """What a user should know of the track, once it is finished."""
+        placement = self._placement
+        if placement is None or placement.other_from_own is not None:
+            return
+        if placement.verdict == AMBIGUOUS:
+            chances = ", ".join(f"{way.probability:.0%}" for way in placement.proposals[:_MODES])
+            yield (
+                f"ambiguous: the log fits the map of `localize.surfel.prior` in several ways alike ({chances}); "
+                "it has no poses, and the poses table holds the ways as modes"
+            )
+        else:
+            yield "lost: the log was not found in the map of `localize.surfel.prior`; it has no poses"
+
+    def rows(self) -> Iterator[dict[str, list[Any]]]:
+        """Rows of the places table, once the track is finished; none of a log that was not found in the map."""
+        if self._placement is not None and self._placement.other_from_own is None:
+            return
+        for frame, stamp, place, seen in zip(self._frames, self._stamps, self._places, self._seen, strict=True):
+            if place.keyframe is not None:
+                yield place_row(frame, stamp, place, seen)
 
     def part(self) -> bytes:
         """What came since the last part, and how far the track has got."""
@@ -56,38 +116,47 @@ class SurfelEstimator:
         prior = self._track.prior
         arrays: _Arrays = {"bias": prior.bias, "covariance": prior.covariance, "speed": prior.speed}
         arrays["open"] = self._track.open
+        arrays["frames"] = np.array([self._frames[index] for index in new], np.int64)
         arrays["stamps"] = np.array([self._stamps[index] for index in new], np.int64)
-        return pack(arrays | {str(index): as_array(_packed(self._track.places[index])) for index in new})
+        kept = {str(index): as_array(_packed(self._track.places[index], self._seen[index])) for index in new}
+        return pack(arrays | kept)
 
     def restore(self, parts: Sequence[bytes]) -> None:
         """Go on where the last of these parts was taken; they are all that were."""
-        self._track, self._stamps = Track(self._config), []
+        self._track, self._frames, self._stamps, self._seen = Track(self._config), [], [], []
         for part in parts:
             arrays = unpack(part)
             prior = self._track.prior
             prior.bias, prior.covariance, prior.speed = arrays["bias"], arrays["covariance"], arrays["speed"]
             self._track.open = arrays["open"]
-            for stamp in arrays["stamps"].tolist():
-                self._track.places.append(_unpacked(arrays[str(len(self._stamps))].tobytes()))
+            for frame, stamp in zip(arrays["frames"].tolist(), arrays["stamps"].tolist(), strict=True):
+                place, seen = _unpacked(arrays[str(len(self._stamps))].tobytes())
+                self._track.places.append(place)
+                self._seen.append(seen)
+                self._frames.append(frame)
                 self._stamps.append(stamp)
         self._kept = len(self._stamps)
 
 
-def _estimate(place: Place, map_from_robot: SE2, *, tied: bool) -> PoseEstimate:
+def _source(place: Place, *, tied: bool) -> str:
     if tied:
-        return PoseEstimate(map_from_robot, VISUAL)
-    if place.motion is None:
-        return PoseEstimate(None, NONE)
-    return PoseEstimate(map_from_robot, INERTIAL)
+        return VISUAL
+    return NONE if place.motion is None else INERTIAL
 
 
-def _packed(place: Place) -> bytes:
+def _told(place: Place, source: str) -> PoseEstimate:
+    return PoseEstimate(None if source == NONE else planar(place.pose), source)
+
+
+def _packed(place: Place, seen: Seen) -> bytes:
     motion = place.motion
     arrays: _Arrays = {
         "pose": place.pose,
         "seconds": np.array(place.seconds),
         "motion": np.array([] if motion is None else [motion.x_m, motion.y_m, motion.heading_rad]),
         "linked": np.array(place.linked),
+        "cells": seen.cells,
+        "weights": seen.weights,
     }
     if place.keyframe:
         surfels = place.keyframe.surfels
@@ -96,11 +165,12 @@ def _packed(place: Place) -> bytes:
     return pack(arrays)
 
 
-def _unpacked(packed: bytes) -> Place:
+def _unpacked(packed: bytes) -> tuple[Place, Seen]:
     arrays = unpack(packed)
     keyframe = None
     if "points" in arrays:
         surfels = Surfels(*(arrays[name].astype(np.float64) for name in ("points", "normals", "sigma_m")))
         keyframe = Keyframe(surfels, Sight.from_arrays(arrays))
     motion = SE2(*arrays["motion"].tolist()) if arrays["motion"].size else None
-    return placed(keyframe, arrays["pose"], arrays["seconds"].item(), motion, linked=arrays["linked"].item())
+    place = placed(keyframe, arrays["pose"], arrays["seconds"].item(), motion, linked=arrays["linked"].item())
+    return place, Seen(arrays["cells"], arrays["weights"])

@@ -37,6 +37,10 @@ class Agreement:
     """Sum of differences of depth, each 0 to 3 standard deviations."""
     looked_up: int
     """Samples that fell on one with depth."""
+    hidden: int = 0
+    """Those of them that lie behind what was measured, by 3 standard deviations or more: seen from elsewhere alone."""
+    strangers: int = 0
+    """Those that lie as far before it: where one picture has a thing the other looked through."""
 
     @property
     def mean(self) -> float:
@@ -44,7 +48,12 @@ class Agreement:
         return self.difference / self.looked_up if self.looked_up else _MOST
 
     def __add__(self, other: Agreement) -> Agreement:
-        return Agreement(self.difference + other.difference, self.looked_up + other.looked_up)
+        return Agreement(
+            self.difference + other.difference,
+            self.looked_up + other.looked_up,
+            self.hidden + other.hidden,
+            self.strangers + other.strangers,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +99,9 @@ class Sight:
         measured = self.depth_m[row[inside], column[inside]].astype(np.float64)
         known = measured > 0
         measured, depth = measured[known], depth[inside][known]
-        apart = np.abs(depth - measured) / (_NOISE_M + _NOISE_PER_M * measured**2)
-        return Agreement(float(np.minimum(apart, _MOST).sum()), len(apart))
+        behind = (depth - measured) / (_NOISE_M + _NOISE_PER_M * measured**2)
+        difference = np.minimum(np.abs(behind), _MOST).sum()
+        return Agreement(float(difference), len(behind), int((behind >= _MOST).sum()), int((behind <= -_MOST).sum()))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Everything, to be kept."""

@@ -1,0 +1,135 @@
+"""A map made before, as a file: the places table (data_spec.md, table 16) and back.
+
+A reader needs nothing else: the semantic map is laid out again from the observations of its keyframes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semslam.errors import SemslamError
+from semslam.geometry.frames import planar
+from semslam.geometry.grid import Planes, to_dense, to_sparse
+from semslam.labels import UNOBSERVED
+from semslam.slam.evidence import Evidence
+from semslam.slam.surfel.registration import Submap
+from semslam.slam.surfel.semantic_field import ClassMap
+from semslam.slam.surfel.sight import Sight
+from semslam.slam.surfel.surfels import Surfels
+from semslam.slam.surfel.tracking import Keyframe, Place, placed
+from semslam.tables.parquet import TableFiles
+from semslam.tables.pictures import decode_depth, encode_depth
+from semslam.tables.spec import PLACES
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The observation of a keyframe, sparse."""
+
+    cells: NDArray[np.uint32]
+    weights: NDArray[np.float32]
+
+    @staticmethod
+    def of(planes: Planes | None) -> Seen:
+        """Of dense planes; empty of none."""
+        if planes is None:
+            return Seen(np.zeros(0, np.uint32), np.zeros(0, np.float32))
+        return Seen(*to_sparse(planes))
+
+
+@dataclass(frozen=True)
+class Grid:
+    """What observations are made of."""
+
+    classes: tuple[str, ...]
+    cell_m: float
+    side: int
+
+    def dense(self, seen: Seen) -> Planes | None:
+        """(L, side, side); None if nothing was observed."""
+        if not len(seen.cells):
+            return None
+        planes = to_dense(seen.cells, seen.weights, (len(self.classes), self.side, self.side))
+        planes[UNOBSERVED] = ~planes[1:].any(0)
+        return planes
+
+
+def submap_of(places: Sequence[Place], seen: Iterable[Seen], grid: Grid) -> Submap:
+    """Places with the semantic map that their observations make."""
+    evidence = Evidence(grid.cell_m, grid.side)
+    for place, one in zip(places, seen, strict=True):
+        planes = grid.dense(one)
+        if planes is not None:
+            evidence.add(planes, planar(place.pose), 0)
+    return Submap(places, ClassMap.of(evidence.cells(), grid.cell_m, grid.classes))
+
+
+def place_row(frame: int, stamp_nanos: int, place: Place, seen: Seen) -> dict[str, list[Any]]:
+    """A row of the places table; the place has a picture."""
+    keyframe = place.keyframe
+    if keyframe is None:
+        raise ValueError("a place without a picture")
+    surfels, sight = keyframe.surfels, keyframe.sight
+    row = {
+        "frame": frame,
+        "stamp_nanos": stamp_nanos,
+        "map_from_robot": place.pose.ravel(),
+        "points": surfels.points.astype(np.float32).ravel(),
+        "normals": surfels.normals.astype(np.float32).ravel(),
+        "sigma_m": surfels.sigma_m.astype(np.float32),
+        "depth": encode_depth(sight.depth_m),
+        **dict(zip(("fx", "fy", "cx", "cy"), sight.intrinsics, strict=True)),
+        "robot_from_camera": sight.robot_from_camera.ravel(),
+        "cells": seen.cells,
+        "weights": seen.weights,
+    }
+    return {name: [value] for name, value in row.items()}
+
+
+def read_prior(path: Path, grid: Grid) -> Submap:
+    """A map made before.
+
+    Raises:
+        SemslamError: it is no such file, or its observations are of other classes or cells than `grid`.
+    """
+    table = open_prior(path, grid)
+    rows = [
+        dict(zip(batch, values, strict=True))
+        for batch in table.batches(batch_rows=8)
+        for values in zip(*batch.values(), strict=True)
+    ]
+    seen = [Seen(np.array(row["cells"], np.uint32), np.array(row["weights"], np.float32)) for row in rows]
+    return submap_of([_place(row) for row in rows], seen, grid)
+
+
+def open_prior(path: Path, grid: Grid) -> TableFiles:
+    """The table of a map made before, if it suits the log.
+
+    Raises:
+        SemslamError: it is no such file, or its observations are of other classes or cells than `grid`.
+    """
+    table = TableFiles(PLACES, [path])
+    theirs = Grid(tuple(table.meta["classes"]), float(table.meta["cell_m"]), int(table.meta["side"]))
+    if theirs != grid:
+        raise SemslamError(
+            f"Map `{path}` was made of other observations than this log",
+            details=f"map: cells of {theirs.cell_m:g} m, {', '.join(theirs.classes)}\n"
+            f"log: cells of {grid.cell_m:g} m, {', '.join(grid.classes)}",
+            hint="run both logs with the same detector and the same `[extract]`",
+        )
+    return table
+
+
+def _place(row: dict[str, Any]) -> Place:
+    points, normals = (np.array(row[name], np.float64).reshape(-1, 3) for name in ("points", "normals"))
+    surfels = Surfels(points, normals, np.array(row["sigma_m"], np.float64))
+    robot_from_camera = np.array(row["robot_from_camera"], np.float64).reshape(4, 4)
+    intrinsics = (row["fx"], row["fy"], row["cx"], row["cy"])
+    keyframe = Keyframe(surfels, Sight(decode_depth(row["depth"]), intrinsics, robot_from_camera))
+    return placed(keyframe, np.array(row["map_from_robot"]).reshape(4, 4), 0.0, None, linked=True)
