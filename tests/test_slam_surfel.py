@@ -30,6 +30,7 @@ from semslam.tables.pictures import encode_colour, encode_depth
 from semslam.tables.spec import CELLS, FRAMES, PLACES, POSES, SNAPSHOTS
 from tests.depth_world import (
     ROBOT_FROM_CAMERA,
+    SECOND,
     Room,
     make_drive,
     make_room,
@@ -213,15 +214,48 @@ def test_smoothing_makes_it_better() -> None:
     assert smoothed < walked
 
 
-def test_without_motion_depth_will_do() -> None:
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_without_motion_depth_will_do(seed: int) -> None:
     """A robot that does not tell its motion is found all the same, if it moves little between keyframes."""
     drive = [SE2(0.0, 0.0, 0.0)]
-    for _ in range(11):
-        drive.append(drive[-1] @ SE2(0.1, 0.0, 0.15))
-    steps = [replace(step, motion=None) for step in make_views(make_room(), drive)]
+    for _ in range(5):
+        drive.append(drive[-1] @ SE2(0.15, 0.0, 0.25))
+    steps = [replace(step, motion=None) for step in make_views(make_room(seed), drive)]
     worst_m, worst_deg = errors(track(steps), drive)
     assert worst_m < 0.03
     assert worst_deg < 1.0
+
+
+def test_a_parked_robot_is_found_where_it_was() -> None:
+    """Through a pause of ten minutes the odometry of a robot with a steady error rests."""
+    drive = make_drive(12)
+    steps = make_views(make_room(), drive, bias=BIAS)
+    for index in range(8, 12):
+        steps[index] = replace(steps[index], stamp_nanos=steps[index].stamp_nanos + 600 * SECOND)
+    parked = replace(steps[8], view=steps[7].view, motion=SE2(0.001, 0.0, 0.0))
+    after = replace(steps[9], motion=drive[7].between(drive[9]))
+    found = track([*steps[:8], parked, after, *steps[10:]])
+    assert errors(found, [*drive[:8], drive[7], *drive[9:]])[0] < 0.03
+    assert {one.source for one in found[1:]} == {"visual"}
+
+
+def test_stamps_that_repeat_or_run_back_are_no_crash() -> None:
+    """Nor is a gap of years."""
+    drive = make_drive(6)
+    steps = make_views(make_room(), drive)
+    for shift in (-SECOND, -2 * SECOND, 10**18):
+        moved = [*steps[:3], *(replace(one, stamp_nanos=one.stamp_nanos + shift) for one in steps[3:])]
+        assert len(track(moved)) == 6
+    assert errors(track([*steps[:3], replace(steps[3], stamp_nanos=2 * SECOND), *steps[4:]]), drive)[0] < 0.03
+
+
+def test_the_first_picture_may_come_late() -> None:
+    """The track starts without it, and what comes later is tied to it."""
+    drive = make_drive(8)
+    steps = make_views(make_room(), drive)
+    found = track([replace(steps[0], view=None), *steps[1:]])
+    assert [one.source for one in found] == ["start", *["visual"] * 7]
+    assert errors(found, drive)[0] < 0.03
 
 
 def test_a_blind_keyframe_is_expected_where_motion_leads() -> None:
@@ -246,15 +280,22 @@ def test_odometry_that_is_set_anew_is_not_believed() -> None:
 
 
 def test_a_place_without_overlap_begins_anew() -> None:
-    """Keyframes of another room are tied to each other and called inertial, and the first room is known again."""
-    here, there = make_room(), make_room(7)
-    drive = make_drive(12)
+    """Keyframes of a hall are tied to nothing known: their poses are those of motion, and the room is known again."""
+    here = make_room()
+    hall = Room(np.array([-30.0, -30.0, 0.0]), np.array([30.0, 30.0, 9.0]), here.boxes + [14.0, 0.0, 0.0])
+    drive = make_drive(8)
     steps = make_views(here, drive, noise_m=0.01)
-    for index in (5, 6, 7):
-        steps[index] = replace(steps[index], view=there.view(matrix(drive[index])))
+    for index in (2, 3):
+        steps[index] = replace(steps[index], view=hall.view(matrix(drive[index])))
     found = track(steps)
-    assert [found[index].source for index in (4, 8, 11)] == ["visual"] * 3
-    assert errors(found[:5] + found[8:], drive[:5] + drive[8:])[0] < 0.03
+    assert [one.source for one in found[1:]] == ["visual", *["inertial"] * 2, *["visual"] * 4]
+    assert errors(found[:2] + found[4:], drive[:2] + drive[4:])[0] < 0.03
+    estimator = SurfelEstimator(CONFIG, GRID)
+    for step in steps:
+        estimator.step(step)
+    estimator.finish()
+    assert [row["frame"][0] for row in estimator.rows()] == [0, 1, 4, 5, 6, 7]
+    assert next(estimator.warnings()).startswith("2 keyframes show nothing that the others do")
 
 
 def test_neither_motion_nor_picture_is_no_pose() -> None:
@@ -273,6 +314,7 @@ def test_neither_motion_nor_picture_is_no_pose() -> None:
 def test_parts_hold_everything() -> None:
     """A track put away and taken up twice ends with the very numbers of one that was not."""
     steps = make_views(make_room(), make_drive(9), bias=BIAS, noise_m=0.02, noise_rad=0.02)
+    steps[3], steps[7] = replace(steps[3], view=None), replace(steps[7], motion=None)
     whole, parts = track(steps), list[bytes]()
     estimator = SurfelEstimator(CONFIG, GRID)
     for start, stop in ((0, 4), (4, 7), (7, 9)):
@@ -352,6 +394,7 @@ def test_another_room_is_not_found(tmp_path: Path) -> None:
     found, warnings = find(path, make_room(11), make_drive(9))
     assert all(one.map_from_robot is None for one in found)
     assert "lost" in warnings[0]
+    assert all(one.modes == () for one in found)
 
 
 def test_a_map_of_other_classes_is_refused(tmp_path: Path) -> None:
@@ -360,8 +403,22 @@ def test_a_map_of_other_classes_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SemslamError, match="other observations") as caught:
         read_prior(path, replace(GRID, classes=CLASSES[:-1]))
     assert "same detector" in caught.value.hint
-    with pytest.raises(SemslamError, match="missing"):
+    with pytest.raises(SemslamError, match="other observations") as caught:
+        read_prior(path, replace(GRID, side=SIDE + 2))
+    assert f"{SIDE + 2} x {SIDE + 2} cells" in caught.value.details
+    with pytest.raises(SemslamError, match="missing") as caught:
         read_prior(tmp_path / "none.parquet", GRID)
+    assert "semslam run LOG --estimator surfel" in caught.value.hint
+
+
+def test_a_single_keyframe_is_found(tmp_path: Path) -> None:
+    """With its pose."""
+    room, drive = make_room(5), make_drive(12)
+    found, _ = find(make_map(tmp_path, room, drive), room, drive[3:4])
+    assert [one.source for one in found] == ["visual"]
+    assert found[0].map_from_robot is not None
+    apart = drive[3].between(found[0].map_from_robot)
+    assert math.hypot(apart.x_m, apart.y_m) < 0.03
 
 
 def test_a_map_comes_back_from_its_file(tmp_path: Path) -> None:
@@ -383,6 +440,8 @@ def test_the_field_of_maps_without_cells_is_empty() -> None:
     none = ClassMap(np.zeros((0, 2)), np.zeros(0, np.int64), CELL_M, CLASSES)
     some = ClassMap(np.ones((1, 2)), np.ones(1, np.int64), CELL_M, CLASSES)
     assert candidates(none, some, 3) == candidates(some, none, 3) == []
+    far = ClassMap(np.array([[0.0, 0.0], [2000.0, 1500.0]]), np.ones(2, np.int64), CELL_M, CLASSES)
+    assert candidates(some, far, 3) == candidates(far, some, 3) == []
     with pytest.raises(ValueError, match="classes"):
         candidates(some, replace(some, classes=CLASSES[:-1]), 3)
 

@@ -204,7 +204,13 @@ def _settings(given: Mapping[str, Any]) -> dict[str, Any]:
         settings["localize.estimators"] = list(given["estimators"])
     if given.get("prior"):
         settings["localize.surfel.prior"] = _prior(Path(given["prior"]))
-        settings.setdefault("localize.estimators", ["surfel"])
+        if "surfel" not in settings.get("localize.estimators", ["surfel"]):
+            raise UsageError(
+                "`--prior` is for the estimator `surfel`, which is not among those named",
+                hint="add `--estimator surfel`",
+            )
+        if not given.get("config_file"):
+            settings.setdefault("localize.estimators", ["surfel"])
     return settings
 
 

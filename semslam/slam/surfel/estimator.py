@@ -7,6 +7,7 @@ Nothing is told of a keyframe before the last one was taken, since the last one 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,7 @@ class SurfelEstimator:
         self._seen: list[Seen] = []
         self._kept = 0  # keyframes that earlier parts hold
         self._places: list[Place] = []
+        self._sources: list[str] = []
         self._placement: Placement | None = None
 
     def step(self, step: Step) -> None:
@@ -67,29 +69,51 @@ class SurfelEstimator:
         # Of the first one's tilt nothing: what is upright all keyframes tell together.
         start = invert(matrix_of(planar(smoothed.places[0].pose)))
         self._places = [moved(place, start @ place.pose) for place in smoothed.places]
-        sources = [_source(place, tied=tied) for place, tied in zip(self._places, smoothed.tied, strict=True)]
+        self._sources = _sources(self._places, smoothed.together)
         if self._prior is None:
-            poses = [_told(place, source) for place, source in zip(self._places[1:], sources[1:], strict=True)]
-            return [PoseEstimate(SE2(0.0, 0.0, 0.0), START), *poses]
-        self._placement = place_in(submap_of(self._places, self._seen, self._grid), self._prior)
-        return self._laid(self._placement, sources)
+            self._sources[0] = START
+            return self._told()
+        known = list(self._known())
+        own = submap_of([place for _, place, _ in known], [seen for _, _, seen in known], self._grid)
+        self._placement = place_in(own, self._prior)
+        return self._laid(self._placement)
 
-    def _laid(self, placement: Placement, sources: Sequence[str]) -> list[PoseEstimate]:
-        """The poses in the map made before; none, only modes, if that is not sure."""
+    def _known(self) -> Iterator[tuple[int, Place, Seen]]:
+        """Number, place and observation of keyframes whose place pictures tell."""
+        whole = zip(self._places, self._sources, self._seen, strict=True)
+        for index, (place, source, seen) in enumerate(whole):
+            if source in (START, VISUAL) and place.keyframe is not None:
+                yield index, place, seen
+
+    def _told(self) -> list[PoseEstimate]:
+        """The poses as they stand."""
+        return [
+            PoseEstimate(None if source == NONE else planar(place.pose), source)
+            for place, source in zip(self._places, self._sources, strict=True)
+        ]
+
+    def _laid(self, placement: Placement) -> list[PoseEstimate]:
+        """The poses in the map made before. None if that is not sure; if there are several ways, they are the modes."""
         ways = [(way.other_from_own, way.probability) for way in placement.proposals[:_MODES]]
         modes = [
             tuple(Mode(way @ planar(place.pose), probability) for way, probability in ways) for place in self._places
         ]
         found = placement.other_from_own
         if found is None:
-            return [PoseEstimate(None, NONE, modes=some) for some in modes]
+            told = modes if placement.verdict == AMBIGUOUS else [()] * len(modes)
+            return [PoseEstimate(None, NONE, modes=some) for some in told]
         self._places = [moved(place, matrix_of(found) @ place.pose) for place in self._places]
-        told = [_told(place, source) for place, source in zip(self._places, sources, strict=True)]
-        return [PoseEstimate(one.map_from_robot, one.source, modes=some) for one, some in zip(told, modes, strict=True)]
+        return [replace(one, modes=some) for one, some in zip(self._told(), modes, strict=True)]
 
     def warnings(self) -> Iterator[str]:
         """What a user should know of the track, once it is finished."""
         placement = self._placement
+        apart = sum(source != VISUAL for source in self._sources[1:])
+        if apart:
+            yield (
+                f"{apart:,} keyframes show nothing that the others do; their poses, if any, are those of motion alone, "
+                "and they are left out of `places.parquet`"
+            )
         if placement is None or placement.other_from_own is not None:
             return
         if placement.verdict == AMBIGUOUS:
@@ -105,9 +129,8 @@ class SurfelEstimator:
         """Rows of the places table, once the track is finished; none of a log that was not found in the map."""
         if self._placement is not None and self._placement.other_from_own is None:
             return
-        for frame, stamp, place, seen in zip(self._frames, self._stamps, self._places, self._seen, strict=True):
-            if place.keyframe is not None:
-                yield place_row(frame, stamp, place, seen)
+        for index, place, seen in self._known():
+            yield place_row(self._frames[index], self._stamps[index], place, seen)
 
     def part(self) -> bytes:
         """What came since the last part, and how far the track has got."""
@@ -138,14 +161,17 @@ class SurfelEstimator:
         self._kept = len(self._stamps)
 
 
-def _source(place: Place, *, tied: bool) -> str:
-    if tied:
-        return VISUAL
-    return NONE if place.motion is None else INERTIAL
-
-
-def _told(place: Place, source: str) -> PoseEstimate:
-    return PoseEstimate(None if source == NONE else planar(place.pose), source)
+def _sources(places: Sequence[Place], together: Sequence[bool]) -> list[str]:
+    """Where poses come from: pictures that are tied to the first, else unbroken motion from there, else nowhere."""
+    sources: list[str] = []
+    for place, tied in zip(places, together, strict=True):
+        if tied:
+            sources.append(VISUAL)
+        elif not sources or (place.motion is not None and sources[-1] != NONE):
+            sources.append(INERTIAL)
+        else:
+            sources.append(NONE)
+    return sources
 
 
 def _packed(place: Place, seen: Seen) -> bytes:

@@ -19,6 +19,8 @@ Floats = NDArray[np.float64]
 
 UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S = 0.4, 0.5
 """Standard deviations of the motion of a robot that does not tell it."""
+_LONGEST_S = 60.0
+"""In a longer step a robot that does not tell its motion gets no farther."""
 _GATE = 16.0
 """A step whose squared Mahalanobis distance exceeds this tells nothing of steady errors."""
 
@@ -49,8 +51,8 @@ class MotionPrior:
     def expect(self, motion: SE2 | None, seconds: float) -> Expected:
         """The true motion of a step for which this was measured."""
         if motion is None:
-            x, y, heading = self.speed * seconds
-            away, turn = UNKNOWN_SPEED_M_S * seconds, UNKNOWN_TURN_RAD_S * seconds
+            x, y, heading = self.speed * min(seconds, 1.0)
+            away, turn = (speed * min(seconds, _LONGEST_S) for speed in (UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S))
             return Expected(SE2(x, y, wrap_angle(heading)), np.diag([away**2, away**2, turn**2]))
         x, y, heading = np.array([motion.x_m, motion.y_m, motion.heading_rad]) - self.bias * seconds
         random = np.diag(np.square(noise_sigmas(self.config))) * seconds

@@ -23,7 +23,7 @@ from semslam.slam.surfel.semantic_field import ClassMap
 from semslam.slam.surfel.sight import Sight
 from semslam.slam.surfel.surfels import Surfels
 from semslam.slam.surfel.tracking import Keyframe, Place, placed
-from semslam.tables.parquet import TableFiles
+from semslam.tables.parquet import TableFiles, made_by
 from semslam.tables.pictures import decode_depth, encode_depth
 from semslam.tables.spec import PLACES
 
@@ -99,13 +99,14 @@ def read_prior(path: Path, grid: Grid) -> Submap:
         SemslamError: it is no such file, or its observations are of other classes or cells than `grid`.
     """
     table = open_prior(path, grid)
-    rows = [
-        dict(zip(batch, values, strict=True))
-        for batch in table.batches(batch_rows=8)
-        for values in zip(*batch.values(), strict=True)
-    ]
-    seen = [Seen(np.array(row["cells"], np.uint32), np.array(row["weights"], np.float32)) for row in rows]
-    return submap_of([_place(row) for row in rows], seen, grid)
+    places: list[Place] = []
+    seen: list[Seen] = []
+    for batch in table.batches(batch_rows=8):
+        for values in zip(*batch.values(), strict=True):
+            row = dict(zip(batch, values, strict=True))
+            places.append(_place(row))
+            seen.append(Seen(np.array(row["cells"], np.uint32), np.array(row["weights"], np.float32)))
+    return submap_of(places, seen, grid)
 
 
 def open_prior(path: Path, grid: Grid) -> TableFiles:
@@ -114,13 +115,21 @@ def open_prior(path: Path, grid: Grid) -> TableFiles:
     Raises:
         SemslamError: it is no such file, or its observations are of other classes or cells than `grid`.
     """
-    table = TableFiles(PLACES, [path])
-    theirs = Grid(tuple(table.meta["classes"]), float(table.meta["cell_m"]), int(table.meta["side"]))
+    with made_by("semslam run LOG --estimator surfel --out OUT"):
+        table = TableFiles(PLACES, [path])
+    try:
+        theirs = Grid(tuple(table.meta["classes"]), float(table.meta["cell_m"]), int(table.meta["side"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise SemslamError(
+            f"Map `{path}` does not say what its observations are made of", hint="make it again with this semslam"
+        ) from error
     if theirs != grid:
         raise SemslamError(
             f"Map `{path}` was made of other observations than this log",
-            details=f"map: cells of {theirs.cell_m:g} m, {', '.join(theirs.classes)}\n"
-            f"log: cells of {grid.cell_m:g} m, {', '.join(grid.classes)}",
+            details="\n".join(
+                f"{name}: {one.side} x {one.side} cells of {one.cell_m:g} m, {', '.join(one.classes)}"
+                for name, one in (("map", theirs), ("log", grid))
+            ),
             hint="run both logs with the same detector and the same `[extract]`",
         )
     return table

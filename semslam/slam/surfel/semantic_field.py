@@ -29,6 +29,7 @@ OBSTACLE_AND_OBSTACLE, OBSTACLE_AND_FLOOR, FLOOR_AND_FLOOR = 1.2, -1.5, 0.25
 COARSE_M = 0.2
 """Cell of the field, metres."""
 HEADINGS = 120
+_WIDEST_M = 500.0
 _APART_M, _APART_RAD = 0.5, math.radians(10)
 """Modes nearer to a better one than this, in place and heading, are that one."""
 
@@ -63,16 +64,23 @@ class Candidate:
 def candidates(own: ClassMap, other: ClassMap, most: int, headings: int = HEADINGS) -> list[Candidate]:
     """The best modes of the field, best first.
 
+    None of maps wider than 500 m, which a field does not fit.
+
     Raises:
         ValueError: the maps know different classes.
     """
     if own.classes != other.classes:
         raise ValueError("maps of different classes")
-    if not len(own.points) or not len(other.points):
+    if not len(own.points) or not len(other.points) or _too_wide(own) or _too_wide(other):
         return []
     field = _Field(own, other)
     peaks = [peak for number in range(headings) for peak in field.peaks(math.tau * number / headings, most)]
     return _distinct(sorted(peaks, key=lambda one: -one.score), most)
+
+
+def _too_wide(one: ClassMap) -> bool:
+    """Whether a few cells lie so far off that the field would not fit into memory: poses that are none."""
+    return bool(np.ptp(one.points, axis=0).max() > _WIDEST_M)
 
 
 class _Field:
@@ -92,10 +100,8 @@ class _Field:
         columns, rows = cells.max(0) + 1 + self._half
         there = _raster(cells, other.class_id, len(other.classes), int(rows), int(columns))
         there *= np.float32((other.cell_m / COARSE_M) ** 2)
-        weights = weights_of(len(other.classes))
-        self._evidence = {
-            one: np.tensordot(weights[one], there, 1).astype(np.float32) for one in self._present
-        }  # (rows, columns) each
+        weights = weights_of(len(other.classes)).astype(np.float32)
+        self._evidence = {one: np.tensordot(weights[one], there, 1) for one in self._present}  # (rows, columns) each
 
     def peaks(self, heading_rad: float, most: int) -> list[Candidate]:
         """The best places of our map, turned by a heading."""

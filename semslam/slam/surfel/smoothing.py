@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from semslam.geometry.frames import Matrix
 from semslam.slam.surfel.alignment import between, change_between, nudged, rotation_vector
 from semslam.slam.surfel.motion_prior import UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S, bias_sigmas, noise_sigmas
 from semslam.slam.surfel.sight import agreement
-from semslam.slam.surfel.tracking import Keyframe, Place, moved, shared_voxels, unlevel
+from semslam.slam.surfel.tracking import HELD_M, SHORTEST_S, Keyframe, Place, held, moved, shared_voxels, unlevel
 from semslam.stages.settings import SurfelConfig
 
 Floats = NDArray[np.float64]
@@ -31,9 +32,10 @@ _LEAST_SHARED = 0.15
 _MIN_MATCHES = 30
 _WORST = 1.6
 """Mean difference of two pictures, in standard deviations, above which the pair is left out."""
+_MOST_SIGMAS = 5.0
+"""Motion that is farther off than this has less than half of its weight (Cauchy): slipping wheels, a parked robot."""
 _STILL = 1e-3
 """Metres and radians of a change that is no improvement any more."""
-_SHORTEST_S = 1e-3
 _FREE = 1e-3
 """Keeps what nothing ties solvable."""
 
@@ -45,18 +47,41 @@ class Smoothed:
     places: list[Place]
     bias: Floats
     """(3,) steady error of motion, m/s, m/s, rad/s."""
-    tied: list[bool]
-    """Whether surfaces tie a keyframe to another."""
+    ties: list[tuple[int, int]]
+    """Keyframes that surfaces tie to each other."""
+
+    @property
+    def together(self) -> list[bool]:
+        """Whether surfaces tie a keyframe to the first one that has a picture, over whatever others: in the end, or
+        when it was taken."""
+        pictured = [index for index, place in enumerate(self.places) if len(place.voxels)]
+        group = list(range(len(self.places)))
+        linked = [index for index in pictured if self.places[index].linked]
+        for first, second in (*self.ties, *pairwise(linked)):
+            one, other = _root(group, first), _root(group, second)
+            group[max(one, other)] = min(one, other)
+        first = _root(group, pictured[0]) if pictured else -1
+        return [_root(group, index) == first for index in range(len(self.places))]
+
+
+def _root(group: list[int], index: int) -> int:
+    while group[index] != index:
+        group[index] = group[group[index]]
+        index = group[index]
+    return index
 
 
 def smooth(
     places: Sequence[Place], bias: Floats, config: SurfelConfig, watch: Callable[[int], None] | None = None
 ) -> Smoothed:
     """Align all places with each other; `watch` hears of each round."""
-    result = Smoothed(list(places), bias, [place.linked for place in places])
+    result = Smoothed(list(places), bias, [])
     for number in range(config.rounds):
         reach_m = _REACHES_M[min(number, len(_REACHES_M) - 1)]
-        before, result = result, _round(result, reach_m, config)
+        before, after = result, _round(result, reach_m, config)
+        if after is None:
+            break
+        result = after
         if watch:
             watch(number + 1)
         if number >= len(_REACHES_M) and _settled(before.places, result.places):
@@ -70,21 +95,22 @@ def _settled(before: Sequence[Place], after: Sequence[Place]) -> bool:
     return bool(np.abs(changes).max(initial=0.0) < _STILL)
 
 
-def _round(before: Smoothed, reach_m: float, config: SurfelConfig) -> Smoothed:
+def _round(before: Smoothed, reach_m: float, config: SurfelConfig) -> Smoothed | None:
+    """All poses anew; None if they cannot be solved for."""
     places = before.places
     equations = _Equations(len(places))
-    tied = [False] * len(places)
-    for first, second in pairs_of(places, config.neighbours):
-        if _tie(equations, places, first, second, reach_m):
-            tied[first] = tied[second] = True
+    pairs = pairs_of(places, config.neighbours)
+    ties = [pair for pair in pairs if _tie(equations, places, *pair, reach_m)]
     for index in range(len(places)):
         _level(equations, places, index, config)
         if index:
             _move(equations, places, index, before.bias, config)
     equations.add((equations.bias,), np.diag(1.0 / bias_sigmas(config) ** 2), before.bias / bias_sigmas(config) ** 2)
     changes = equations.solved()
+    if changes is None:
+        return None
     after = [moved(place, nudged(place.pose, change)) for place, change in zip(places, changes[:-1], strict=True)]
-    return Smoothed(after, before.bias + changes[-1], tied)
+    return Smoothed(after, before.bias + changes[-1], ties)
 
 
 def pairs_of(places: Sequence[Place], most: int) -> list[tuple[int, int]]:
@@ -116,13 +142,15 @@ def _tie(equations: _Equations, places: Sequence[Place], first: int, second: int
 def _compare(
     equations: _Equations, source: tuple[int, Keyframe, Matrix], target: tuple[int, Keyframe, Matrix], reach_m: float
 ) -> bool:
-    """Lay one keyframe's surfels on another's; False if too few come to lie there."""
+    """Lay one keyframe's surfels on another's. False if too few come to lie there, or if they leave it free to slide: a
+    floor alone tells heights, not places."""
     (index, keyframe, pose), (toward, known, place) = source, target
     fit = known.target.fit(keyframe.surfels.moved(between(place, pose)), reach_m)
     if len(fit) < _MIN_MATCHES:
         return False
-    equations.add((index, toward), *fit.turned(place).pair_equations(pose[:3, 3], place[:3, 3]))
-    return True
+    hessian, gradient = fit.turned(place).pair_equations(pose[:3, 3], place[:3, 3])
+    equations.add((index, toward), hessian, gradient)
+    return bool(held(hessian[:6, :6]) > HELD_M**-2)
 
 
 def _level(equations: _Equations, places: Sequence[Place], index: int, config: SurfelConfig) -> None:
@@ -137,7 +165,7 @@ def _level(equations: _Equations, places: Sequence[Place], index: int, config: S
 def _move(equations: _Equations, places: Sequence[Place], index: int, bias: Floats, config: SurfelConfig) -> None:
     """Motion between neighbours in time, less its steady error; of a robot that does not tell it, what is likely."""
     before, place = places[index - 1], places[index]
-    seconds = max(place.seconds, _SHORTEST_S)
+    seconds = max(place.seconds, SHORTEST_S)
     if place.motion is None:
         x, y, turn, steady = 0.0, 0.0, 0.0, 0.0
         noise = np.array([UNKNOWN_SPEED_M_S, UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S]) ** 2 * seconds**2
@@ -156,7 +184,8 @@ def _move(equations: _Equations, places: Sequence[Place], index: int, bias: Floa
     jacobian[3:, :3] = [[0, -shift[2], shift[1]], [shift[2], 0, -shift[0]], [-shift[1], shift[0], 0]]
     jacobian[2, 14] = steady
     jacobian[3:, 12:14] = before.pose[:3, :2] * steady
-    weight = np.diag([_FREE, _FREE, 1 / noise[2], 1 / noise[0], 1 / noise[1], _FREE])
+    doubt = 1.0 + float((error[[2, 3, 4]] ** 2 / noise[[2, 0, 1]]).sum()) / _MOST_SIGMAS**2
+    weight = np.diag([_FREE, _FREE, 1 / noise[2], 1 / noise[0], 1 / noise[1], _FREE]) / doubt
     weighted = jacobian.T @ weight
     equations.add((index - 1, index, equations.bias), weighted @ jacobian, weighted @ error)
 
@@ -188,7 +217,11 @@ class _Equations:
             blocks.append(-gradient[part])
         self._graph.add(self._gtsam.HessianFactor(*keys, *blocks, 0.0))
 
-    def solved(self) -> list[Floats]:
-        """The changes of all poses (6,), then that of the bias (3,)."""
-        found = self._graph.optimize()
-        return [np.asarray(found.at(key)) for key in range(self.bias + 1)]
+    def solved(self) -> list[Floats] | None:
+        """The changes of all poses (6,), then that of the bias (3,); None if the equations do not determine them."""
+        try:
+            found = self._graph.optimize()
+        except RuntimeError:  # gtsam's IndeterminantLinearSystemException: steps of years, motion beyond the planet
+            return None
+        changes = [np.asarray(found.at(key)) for key in range(self.bias + 1)]
+        return changes if all(np.isfinite(change).all() for change in changes) else None

@@ -26,6 +26,14 @@ from semslam.stages.settings import SurfelConfig
 
 Floats = NDArray[np.float64]
 
+SHORTEST_S = 1e-3
+"""Between keyframes; stamps that repeat or run back count as this."""
+HELD_M = 0.1
+"""Standard deviation along the floor up to which surfaces hold one keyframe to another: a floor alone tells heights."""
+_PAUSE_S = 5.0
+"""After a longer step the robot may have been parked."""
+_LONGEST_S = 60.0
+"""Steps count as no longer than this where a robot's motion is bounded."""
 VOXEL_M = 0.25
 """Keyframes that have surfels in the same voxels see the same."""
 _COMPARED = 60
@@ -38,6 +46,8 @@ _STILL = 1e-4
 """Metres and radians of a change that need no other."""
 _HEADING_STEP_RAD = math.radians(1.0)
 _MOST_STARTS = 25
+_EVENLY = 8
+"""Of more headings than this, about so many are looked at closely in any case."""
 _OPEN_SIGMAS = 2.5
 _STARTS_KEPT = 2
 """Of the headings tried so many, or a quarter, are looked at closely."""
@@ -129,21 +139,30 @@ class Track:
         """Take the next keyframe; `seconds` since the one before, at which `motion` began."""
         if not self.places:
             return self._remember(keyframe, np.eye(4), 0.0, None, linked=True)
-        before = self.places[-1]
-        if motion is not None and math.hypot(motion.x_m, motion.y_m) > max(JUMP_M, JUMP_M_PER_S * seconds):
+        before, seconds = self.places[-1], max(seconds, SHORTEST_S)
+        if motion is not None and math.hypot(motion.x_m, motion.y_m) > max(
+            JUMP_M, JUMP_M_PER_S * min(seconds, _LONGEST_S)
+        ):
             motion = None  # odometry that was set anew, not a robot
         expected = self.prior.expect(motion, seconds)
         start = before.pose @ matrix_of(expected.motion)
-        whole = self.open + expected.covariance
-        found = self._find(keyframe, start, whole, linked=True)
+        if not any(len(place.voxels) for place in self.places):  # the first picture: there is nothing to find it in
+            return self._remember(keyframe, start, seconds, motion, linked=keyframe is not None)
+        starts = [start]
+        if seconds > _PAUSE_S and motion is not None:  # a parked robot's odometry rests, and its errors with it
+            starts += [before.pose @ matrix_of(motion), before.pose]
+        found = self._find(keyframe, starts, self.open + expected.covariance, linked=True)
         if found is None:
             return self._go_on(keyframe, start, seconds, motion, expected)
+        if held(found[1]) < HELD_M**-2:  # along a corridor motion tells the way; across it the walls do
+            self.open = self.open + expected.covariance
+            return self._remember(keyframe, found[0], seconds, motion, linked=False)
         self.open = np.zeros((3, 3))
         pose, hessian = found
         if before.linked:
             seen = planar(between(before.pose, pose))
             self.prior.see(seen, seconds)
-            if motion is not None:
+            if motion is not None and seconds <= _PAUSE_S:
                 self.prior.learn(motion, seconds, seen, _covariance_in_robot(hessian, before.pose))
         return self._remember(keyframe, pose, seconds, motion, linked=True)
 
@@ -151,7 +170,7 @@ class Track:
         self, keyframe: Keyframe | None, start: Matrix, seconds: float, motion: SE2 | None, expected: Expected
     ) -> Place:
         """Without a link to what is known: among keyframes that have none either, or as motion leads."""
-        found = self._find(keyframe, start, expected.covariance, linked=False)
+        found = self._find(keyframe, [start], expected.covariance, linked=False)
         if found is None:
             self.open = self.open + expected.covariance
         return self._remember(keyframe, start if found is None else found[0], seconds, motion, linked=False)
@@ -164,14 +183,14 @@ class Track:
         return place
 
     def _find(
-        self, keyframe: Keyframe | None, start: Matrix, covariance: Floats, *, linked: bool
+        self, keyframe: Keyframe | None, starts: Sequence[Matrix], covariance: Floats, *, linked: bool
     ) -> tuple[Matrix, Floats] | None:
         """Pose and Hessian (6, 6) of the surfaces alone; None if none of what was seen before, linked or not, fits."""
         if keyframe is None:
             return None
-        near = self._near(placed(keyframe, start, 0.0, None, linked=False), linked=linked)
+        near = self._near(placed(keyframe, starts[0], 0.0, None, linked=False), linked=linked)
         parts = [(place.keyframe, place.pose) for place in near if place.keyframe]
-        return Search(keyframe, parts, start, covariance, self._config).result() if parts else None
+        return Search(keyframe, parts, starts, covariance, self._config).result() if parts else None
 
     def _near(self, place: Place, *, linked: bool) -> list[Place]:
         """The last place and those that see most of the same, best first, of those that are linked or not."""
@@ -200,17 +219,18 @@ class Search:
         self,
         keyframe: Keyframe,
         known: Sequence[tuple[Keyframe, Matrix]],
-        start: Matrix,
+        starts: Sequence[Matrix],
         covariance: Floats,
         config: SurfelConfig,
     ) -> None:
-        """`known`: keyframes with their poses, best first; `covariance` (3, 3) of the start's x, y and heading."""
+        """`known`: keyframes with their poses, best first; `covariance` (3, 3) of x, y and heading of the first start,
+        which motion tells; the others are tried as they are."""
         self._keyframe = keyframe
         self._references = known[:_REFERENCES]
         views = [keyframe, *(other for other, _ in self._references)]
         counts = [len(view.sight.points) for view in views]
         self._samples = counts[0] * (len(counts) - 1) + sum(counts[1:])
-        self._start = start
+        self._start, self._others = starts[0], starts[1:]
         self._target = Target(Surfels.joined([other.surfels.moved(pose) for other, pose in known]))
         self._sigma_m = math.sqrt(max(covariance[0, 0], covariance[1, 1]))
         self._sigma_rad = math.sqrt(covariance[2, 2])
@@ -231,17 +251,20 @@ class Search:
         return pose, fit.equations(pose[:3, 3])[0]
 
     def _starts(self) -> list[Matrix]:
-        """Headings that agree best, none beside another."""
+        """Headings that agree best, none beside another; and, since only what is nearly right already agrees well, some
+        in any case: the one that motion tells, and where many are open, evenly spread ones."""
         open_rad = min(math.pi, max(_HEADING_STEP_RAD, _OPEN_SIGMAS * self._sigma_rad))
         step = max(_HEADING_STEP_RAD, 2 * open_rad / (_MOST_STARTS - 1))
         half = math.ceil(open_rad / step)
         turns = range(-half, half + 1)
         costs = {turn: self._cost(self._start @ matrix_of(SE2(0.0, 0.0, turn * step))) for turn in turns}
-        kept: list[int] = []
+        kept = {0, *list(turns)[:: max(1, len(turns) // _EVENLY)]} if len(turns) > _EVENLY else {0}
+        best: list[int] = []
         for turn in sorted(turns, key=lambda one: (costs[one], abs(one))):
-            if len(kept) < max(_STARTS_KEPT, len(turns) // 4) and all(abs(turn - other) > 1 for other in kept):
-                kept.append(turn)
-        return [self._start @ matrix_of(SE2(0.0, 0.0, turn * step)) for turn in kept]
+            if len(best) < max(_STARTS_KEPT, len(turns) // 4) and all(abs(turn - other) > 1 for other in best):
+                best.append(turn)
+        turned = [self._start @ matrix_of(SE2(0.0, 0.0, turn * step)) for turn in sorted(kept | set(best))]
+        return [*turned, *self._others]
 
     def _beside(self, pose: Matrix) -> Matrix:
         """Look left and right along the direction that the surfaces hold worst, as long as that gets better."""
@@ -317,11 +340,22 @@ def unlevel(pose: Matrix) -> Floats:
     return np.array([-pose[1, 2], pose[0, 2], 0.0, 0.0, 0.0, pose[2, 3]])
 
 
+def held(hessian: Floats) -> float:
+    """Information (1 / m^2) about the place on the floor along which it is known worst, whatever tilt and turn."""
+    return float(_on_floor(hessian)[0][0])
+
+
 def _weakest(hessian: Floats) -> Floats:
     """(2,) unit vector on the floor along which a pose is held worst, whatever its turn."""
+    return _on_floor(hessian)[1][:, 0]
+
+
+def _on_floor(hessian: Floats) -> tuple[Floats, Floats]:
+    """Eigenvalues (2,), rising, and eigenvectors (2, 2) of what a Hessian (6, 6) tells of x and y alone."""
     keep, rest = [3, 4], [0, 1, 2, 5]
     tied = hessian[np.ix_(keep, rest)] @ np.linalg.pinv(hessian[np.ix_(rest, rest)]) @ hessian[np.ix_(rest, keep)]
-    return np.asarray(np.linalg.eigh(hessian[np.ix_(keep, keep)] - tied)[1][:, 0])
+    values, vectors = np.linalg.eigh(hessian[np.ix_(keep, keep)] - tied)
+    return np.asarray(values), np.asarray(vectors)
 
 
 def _covariance_in_robot(hessian: Floats, before: Matrix) -> Floats:
