@@ -21,7 +21,17 @@ from numpy.typing import NDArray
 
 from semslam.bench.published import POSES
 from semslam.bench.results import MapResult, Results
-from semslam.bench.rows import ALL, CONVLSTM, MAP_METHODS, MAP_TITLES, PROTOCOLS, QUALITY_TITLES, SIGHTS, TABLE_1
+from semslam.bench.rows import (
+    ALL,
+    CONVLSTM,
+    MAP_METHODS,
+    MAP_TITLES,
+    PROTOCOLS,
+    QUALITY_TITLES,
+    SIGHTS,
+    TABLE_1,
+    protocols_of,
+)
 from semslam.bench.statistics import Interval, band, interval
 from semslam.labels import FREE_FLOOR, OBSTACLE, UNOBSERVED
 from semslam.pipeline.files import write_text
@@ -77,6 +87,7 @@ _METHODS: dict[str, _Line] = {
     "deepvo": _Line("#E69F00"),
     "mapnet": _Line("#D55E00"),
     "orb_rgbd": _Line("#009E73"),
+    "surfel": _Line("#117733", width=2.6),
     "visual": _Line("#56B4E9", label="visual"),
     "visual_inertial": _Line("#0072B2", width=2.6, label="visual-inertial"),
     "visual_h_33": _Line("#56B4E9", "--", label="visual, h = 33"),
@@ -193,7 +204,7 @@ def table_1(results: Results) -> Figure | None:
             found = interval(results.poses(name, protocol, "ape_m"))
             _dot(axis, found, height, _METHODS.get(name, _Line(_SOFT)).colour)
             printed = POSES.get((name, protocol))
-            if printed:
+            if printed and protocol in protocols_of(ALL[name]):
                 axis.plot(printed.ape_m, height, "D", color=_INK, fillstyle="none", markersize=6, zorder=3)
         axis.set_title(f"{protocol.capitalize()}-scene: position error, m")
         axis.set_yticks(range(len(names)), [ALL[name].title for name in reversed(names)])

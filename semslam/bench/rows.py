@@ -97,6 +97,7 @@ TABLE_1 = (
     Row("visual_inertial_leaky", "Visual-inertial, leaky map", "paper", _LEAKY, note="likewise"),
     _VISUAL_FAR,
     _INERTIAL_FAR,
+    Row("surfel", "surfel", "surfel", note="motion and geometry of the whole log; not of the paper"),
     Row("small_gicp", "small_gicp, scan to map", peer="small_gicp", note="motion and geometry, no semantics"),
     Row("kiss_icp", "kiss-icp", peer="kiss_icp", note="depth as a scan, no motion"),
     Row("pyorbslam3", "pyorbslam3", peer="pyorbslam3"),

@@ -34,6 +34,7 @@ from semslam.bench.rows import (
     VISUAL_SETTINGS,
     VISUAL_SETTINGS_BASE,
     Row,
+    protocols_of,
 )
 from semslam.bench.statistics import Interval, interval, paired
 from semslam.pipeline.files import write_text
@@ -80,7 +81,7 @@ def sheets(results: Results) -> list[Sheet]:
 
 def pose_sheet(results: Results, protocol: str) -> Sheet:
     """Table 1 of the paper for one protocol."""
-    names = rows_in(results, [row.name for row in TABLE_1])
+    names = rows_in(results, [row.name for row in TABLE_1 if protocol in protocols_of(row)])
     rows = tuple(_pose_row(results, name, protocol) for name in names)
     tests = results.conditions.test_logs.get(protocol, 0)
     return Sheet(
