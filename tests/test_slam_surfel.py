@@ -214,7 +214,7 @@ def test_smoothing_makes_it_better() -> None:
     assert smoothed < walked
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_without_motion_depth_will_do(seed: int) -> None:
     """A robot that does not tell its motion is found all the same, if it moves little between keyframes."""
     drive = [SE2(0.0, 0.0, 0.0)]
@@ -354,12 +354,17 @@ def find(path: Path, room: Room, drive: list[SE2]) -> tuple[list[PoseEstimate], 
     return estimator.finish(), list(estimator.warnings())
 
 
-def test_a_log_is_found_in_a_map_made_before(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map of twelve keyframes in room 5."""
+    return make_map(tmp_path_factory.mktemp("known"), make_room(5), make_drive(12))
+
+
+def test_a_log_is_found_in_a_map_made_before(known: Path) -> None:
     """Without a first guess, to the centimetre, and its poses are told in that map's frame."""
-    room, drive = make_room(5), make_drive(12)
-    path = make_map(tmp_path, room, drive)
+    room = make_room(5)
     second = [ELSEWHERE @ pose for pose in make_drive(9)]
-    found, warnings = find(path, room, second)
+    found, warnings = find(known, room, second)
     assert warnings == []
     assert {one.source for one in found} == {"visual"}
     for estimate, true in zip(found, second, strict=True):
@@ -388,10 +393,9 @@ def test_a_room_that_looks_the_same_from_both_ends_is_ambiguous(tmp_path: Path) 
         assert min(math.hypot(one.x_m, one.y_m) for one in apart) < 0.05
 
 
-def test_another_room_is_not_found(tmp_path: Path) -> None:
+def test_another_room_is_not_found(known: Path) -> None:
     """Lost is an answer."""
-    path = make_map(tmp_path, make_room(5), make_drive(12))
-    found, warnings = find(path, make_room(11), make_drive(9))
+    found, warnings = find(known, make_room(11), make_drive(9))
     assert all(one.map_from_robot is None for one in found)
     assert "lost" in warnings[0]
     assert all(one.modes == () for one in found)
@@ -411,10 +415,10 @@ def test_a_map_of_other_classes_is_refused(tmp_path: Path) -> None:
     assert "semslam run LOG --estimator surfel" in caught.value.hint
 
 
-def test_a_single_keyframe_is_found(tmp_path: Path) -> None:
+def test_a_single_keyframe_is_found(known: Path) -> None:
     """With its pose."""
     room, drive = make_room(5), make_drive(12)
-    found, _ = find(make_map(tmp_path, room, drive), room, drive[3:4])
+    found, _ = find(known, room, drive[3:4])
     assert [one.source for one in found] == ["visual"]
     assert found[0].map_from_robot is not None
     apart = drive[3].between(found[0].map_from_robot)
