@@ -57,6 +57,11 @@ GOOD = ["--detector", "detector.onnx", "--classes", "classes.txt"]
         ([*GOOD, "--set", "localize.paper.cell_m=0.2"], "no odd multiple of `extract.cell_m`", "0.3"),
         ([*GOOD, "--prior", "nowhere"], "`--prior nowhere` is no map made before", "results/LOG/surfel"),
         ([*GOOD, "--prior", "classes.txt", "--estimator", "paper"], "for the estimator `surfel`", "--estimator surfel"),
+        (
+            [*GOOD, "--prior", "classes.txt", "--set", "localize.estimators=paper"],
+            "not among those to run",
+            "--estimator surfel",
+        ),
         ([*GOOD, "--prior", "logs"], "there is no `places.parquet`", "results/LOG/surfel"),
         ([*GOOD, "--prior", "classes.txt"], "classes.txt` is damaged", ""),
         ([*GOOD, "--set", "localize.paper.update=learned"], "classes", "localize.paper"),

@@ -413,6 +413,26 @@ def test_a_map_of_other_classes_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SemslamError, match="missing") as caught:
         read_prior(tmp_path / "none.parquet", GRID)
     assert "semslam run LOG --estimator surfel" in caught.value.hint
+    whole = path.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 0xFF
+    for damaged in (b"", whole[:1000], bytes(flipped)):
+        path.write_bytes(damaged)
+        with pytest.raises(SemslamError, match="damaged") as caught:
+            read_prior(path, GRID)
+        assert "semslam run LOG --estimator surfel" in caught.value.hint
+
+
+def test_rows_that_are_no_places_are_refused(tmp_path: Path) -> None:
+    """Of a hand-made file, with the number of the row."""
+    path = make_map(tmp_path, make_room(5), make_drive(2))
+    rows = TableFiles(PLACES, [path]).read()
+    for name, values in (("points", [1.0, 2.0]), ("map_from_robot", [1.0]), ("cells", [4_000_000_000])):
+        spoiled = {**rows, name: [rows[name][0], values]}
+        spoiled |= {"weights": [rows["weights"][0], [1.0]]} if name == "cells" else {}
+        write_table(path, PLACES, spoiled, {"classes": list(CLASSES), "cell_m": CELL_M, "side": SIDE})
+        with pytest.raises(SemslamError, match="is no place"):
+            read_prior(path, GRID)
 
 
 def test_a_single_keyframe_is_found(known: Path) -> None:

@@ -116,10 +116,10 @@ def _small_gicp(frames: Iterator[Keyframe], folder: Path) -> Poses:
         cloud = frame.cloud
         source, _ = gicp.preprocess_points(cloud, _VOXEL_M, num_neighbors=_NEIGHBOURS)
         if len(world):
-            pose = pose @ _matrix(frame.motion or SE2(0.0, 0.0, 0.0))
+            pose = pose @ (frame.motion or SE2(0.0, 0.0, 0.0)).matrix
             target, tree = gicp.preprocess_points(world, _VOXEL_M, num_neighbors=_NEIGHBOURS)
             found = gicp.align(target, source, tree, pose, max_correspondence_distance=_REACH_M, max_iterations=50)
-            pose = _matrix(planar(found.T_target_source)) if found.converged else pose
+            pose = planar(found.T_target_source).matrix if found.converged else pose
         moved = cloud @ pose[:3, :3].T + pose[:3, 3]
         world = gicp.voxelgrid_sampling(np.concatenate([world, moved]), _VOXEL_M / 2).points()[:, :3]
         yield pose
@@ -189,13 +189,6 @@ _PEERS: dict[str, Callable[[Iterator[Keyframe], Path], Poses]] = {
     "kiss_icp": _kiss_icp,
     "pyorbslam3": _pyorbslam3,
 }
-
-
-def _matrix(pose: SE2) -> Matrix:
-    cosine, sine = np.cos(pose.heading_rad), np.sin(pose.heading_rad)
-    matrix = np.eye(4)
-    matrix[:2] = [[cosine, -sine, 0.0, pose.x_m], [sine, cosine, 0.0, pose.y_m]]
-    return matrix
 
 
 def _orb_settings(frame: Keyframe) -> str:

@@ -71,6 +71,14 @@ class SE2:
         """The motion that leads from this pose to `other`, seen from this pose."""
         return self.inverse() @ other
 
+    @property
+    def matrix(self) -> Matrix:
+        """The same as a 4x4 matrix of a z-up frame, on the floor."""
+        cosine, sine = math.cos(self.heading_rad), math.sin(self.heading_rad)
+        matrix = np.eye(4)
+        matrix[:2] = [[cosine, -sine, 0.0, self.x_m], [sine, cosine, 0.0, self.y_m]]
+        return matrix
+
     def apply(self, points: ArrayLike) -> NDArray[np.float64]:
         """Points (..., 2) of the child frame in the parent frame."""
         cosine, sine = math.cos(self.heading_rad), math.sin(self.heading_rad)

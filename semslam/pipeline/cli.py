@@ -209,7 +209,10 @@ def _settings(given: Mapping[str, Any]) -> dict[str, Any]:
                 "`--prior` is for the estimator `surfel`, which is not among those named",
                 hint="add `--estimator surfel`",
             )
-        if not given.get("config_file"):
+        elsewhere = given.get("config_file") or any(
+            text.startswith("localize.estimators=") for text in given.get("assignments", ())
+        )
+        if not elsewhere:
             settings.setdefault("localize.estimators", ["surfel"])
     return settings
 

@@ -98,7 +98,12 @@ def _check_localize(config: Config) -> None:
     section, extract = config.of(LOCALIZE), config.of(EXTRACT)
     if any(name.startswith("paper") for name in section.estimators):
         pooling_factor(section.paper, extract.cell_m, extract.side)
-    if "surfel" in section.estimators and section.surfel.prior:
+    if section.surfel.prior:
+        if "surfel" not in section.estimators:
+            raise SemslamError(
+                "`localize.surfel.prior` is for the estimator `surfel`, which is not among those to run",
+                hint="add `--estimator surfel`",
+            )
         open_prior(Path(section.surfel.prior), Grid(_classes(config), extract.cell_m, extract.side))
     for name in section.estimators:
         if model_of(name, section):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.geometry.frames import SE2, invert, planar
+from semslam.geometry.frames import SE2, planar
 from semslam.slam.checkpoint import as_array, pack, unpack
 from semslam.slam.estimator import INERTIAL, NONE, START, VISUAL, Mode, PoseEstimate, Step
 from semslam.slam.surfel.prior import Grid, Seen, place_row, read_prior, submap_of
@@ -22,7 +22,7 @@ from semslam.slam.surfel.registration import AMBIGUOUS, Placement, place_in
 from semslam.slam.surfel.sight import Sight
 from semslam.slam.surfel.smoothing import smooth
 from semslam.slam.surfel.surfels import Surfels
-from semslam.slam.surfel.tracking import Keyframe, Place, Track, matrix_of, moved, placed
+from semslam.slam.surfel.tracking import Keyframe, Place, Track, moved, placed
 from semslam.stages.settings import SurfelConfig
 
 _MODES = 3
@@ -67,7 +67,7 @@ class SurfelEstimator:
             return []
         smoothed = smooth(self._track.places, self._track.prior.bias, self._config, watch)
         # Of the first one's tilt nothing: what is upright all keyframes tell together.
-        start = invert(matrix_of(planar(smoothed.places[0].pose)))
+        start = planar(smoothed.places[0].pose).inverse().matrix
         self._places = [moved(place, start @ place.pose) for place in smoothed.places]
         self._sources = _sources(self._places, smoothed.together)
         if self._prior is None:
@@ -102,7 +102,7 @@ class SurfelEstimator:
         if found is None:
             told = modes if placement.verdict == AMBIGUOUS else [()] * len(modes)
             return [PoseEstimate(None, NONE, modes=some) for some in told]
-        self._places = [moved(place, matrix_of(found) @ place.pose) for place in self._places]
+        self._places = [moved(place, found.matrix @ place.pose) for place in self._places]
         return [replace(one, modes=some) for one, some in zip(self._told(), modes, strict=True)]
 
     def warnings(self) -> Iterator[str]:

@@ -5,7 +5,7 @@ A reader needs nothing else: the semantic map is laid out again from the observa
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,10 @@ from semslam.slam.surfel.tracking import Keyframe, Place, placed
 from semslam.tables.parquet import TableFiles, made_by
 from semslam.tables.pictures import decode_depth, encode_depth
 from semslam.tables.spec import PLACES
+
+
+_COMMAND = "semslam run LOG --estimator surfel --out OUT"
+"""What makes a map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,12 +105,22 @@ def read_prior(path: Path, grid: Grid) -> Submap:
     table = open_prior(path, grid)
     places: list[Place] = []
     seen: list[Seen] = []
+    try:
+        with made_by(_COMMAND):
+            for row in _rows(table):
+                places.append(_place(row))
+                seen.append(Seen(np.array(row["cells"], np.uint32), np.array(row["weights"], np.float32)))
+        return submap_of(places, seen, grid)
+    except (ValueError, IndexError) as error:
+        raise SemslamError(
+            f"Row {len(places)} of map `{path}` is no place: {error}", hint=f"make it again: `{_COMMAND}`"
+        ) from error
+
+
+def _rows(table: TableFiles) -> Iterator[dict[str, Any]]:
     for batch in table.batches(batch_rows=8):
         for values in zip(*batch.values(), strict=True):
-            row = dict(zip(batch, values, strict=True))
-            places.append(_place(row))
-            seen.append(Seen(np.array(row["cells"], np.uint32), np.array(row["weights"], np.float32)))
-    return submap_of(places, seen, grid)
+            yield dict(zip(batch, values, strict=True))
 
 
 def open_prior(path: Path, grid: Grid) -> TableFiles:
@@ -115,7 +129,7 @@ def open_prior(path: Path, grid: Grid) -> TableFiles:
     Raises:
         SemslamError: it is no such file, or its observations are of other classes or cells than `grid`.
     """
-    with made_by("semslam run LOG --estimator surfel --out OUT"):
+    with made_by(_COMMAND):
         table = TableFiles(PLACES, [path])
     try:
         theirs = Grid(tuple(table.meta["classes"]), float(table.meta["cell_m"]), int(table.meta["side"]))

@@ -19,7 +19,7 @@ from semslam.slam.surfel.alignment import Target, between, nudged
 from semslam.slam.surfel.semantic_field import Candidate, ClassMap, candidates
 from semslam.slam.surfel.sight import Agreement, agreement
 from semslam.slam.surfel.surfels import Surfels
-from semslam.slam.surfel.tracking import Keyframe, Place, matrix_of, moved, shared_voxels, unlevel
+from semslam.slam.surfel.tracking import Keyframe, Place, moved, shared_voxels, unlevel
 
 Floats = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ class Proposal:
 
     other_from_own: SE2
     semantic: float
-    """Log likelihood ratio of the cells."""
+    """Evidence of the cells, as `semantic_field` weighs it."""
     likeness: float
     """Log likelihood ratio of a sample that is found again: right pose against wrong one."""
     seen: float
@@ -114,7 +114,7 @@ def place_in(own: Submap, other: Submap) -> Placement:
 
 def _proposal(asked: Sequence[Place], known: Sequence[Place], target: Target, guess: Candidate) -> Proposal:
     """A guess, drawn to where surfaces meet, and what the pictures say there."""
-    shift = matrix_of(guess.other_from_own)
+    shift = guess.other_from_own.matrix
     for reach_m in _REACHES_M:
         fit = target.fit(
             Surfels.joined([place.keyframe.coarse.moved(shift @ place.pose) for place in asked if place.keyframe]),

@@ -1,9 +1,9 @@
 """Where one semantic map lies on another, without a first guess: a field over all headings and cells.
 
 Equation 2 of the paper correlates one observation with a map. Here a whole map is correlated, and what a cell says is
-weighed as evidence: `WEIGHTS` holds, for each pair of classes (own, other), the logarithm of how much more often the
-two lie on each other in maps of one place than by chance. So free floor where a sofa should be counts against a pose as
-a sofa on a sofa counts for it, and what either map has not seen says nothing.
+weighed as evidence: `weights_of` gives, for each pair of classes (own, other), a number in the part of a log likelihood
+ratio, chosen by hand. So free floor where a sofa should be counts against a pose as a sofa on a sofa counts for it, and
+what either map has not seen says nothing. The scores order proposals; what they are worth, pictures decide.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 SAME_OBJECT, OTHER_OBJECT = 2.0, -0.5
 OBJECT_AND_OBSTACLE, OBJECT_AND_FLOOR = 0.2, -1.2
 OBSTACLE_AND_OBSTACLE, OBSTACLE_AND_FLOOR, FLOOR_AND_FLOOR = 1.2, -1.5, 0.25
-"""Logarithms of likelihood ratios of two cells, by what their maps say there."""
+"""Evidence of two cells, by what their maps say there; chosen by hand."""
 COARSE_M = 0.2
 """Cell of the field, metres."""
 HEADINGS = 120
@@ -58,7 +58,7 @@ class Candidate:
 
     other_from_own: SE2
     score: float
-    """Sum of log likelihood ratios of coarse cells."""
+    """Sum of evidence over coarse cells."""
 
 
 def candidates(own: ClassMap, other: ClassMap, most: int, headings: int = HEADINGS) -> list[Candidate]:
@@ -137,7 +137,7 @@ class _Field:
 
 
 def weights_of(classes: int) -> Floats:
-    """(L, L) log likelihood ratios of (own, other)."""
+    """(L, L) evidence of (own, other)."""
     weights = np.zeros((classes, classes))
     objects = slice(FIRST_OBJECT, classes)
     weights[objects, objects] = OTHER_OBJECT

@@ -25,6 +25,8 @@ _COLUMNS = 160
 _NEAREST_M = 0.3
 _NOISE_M, _NOISE_PER_M = 0.01, 0.004
 """Differences of depth are measured in _NOISE_M + _NOISE_PER_M * depth^2: noise, and rounding to a sample."""
+WORST = 1.6
+"""Mean difference, in standard deviations, above which two pictures do not show the same place."""
 _MOST = 3.0
 """A larger difference counts as this."""
 

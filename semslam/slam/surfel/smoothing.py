@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.geometry.frames import Matrix
+from semslam.geometry.frames import Matrix, rotation_from_vector
 from semslam.slam.surfel.alignment import between, change_between, nudged, rotation_vector
 from semslam.slam.surfel.motion_prior import UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S, bias_sigmas, noise_sigmas
-from semslam.slam.surfel.sight import agreement
+from semslam.slam.surfel.sight import WORST, agreement
 from semslam.slam.surfel.tracking import HELD_M, SHORTEST_S, Keyframe, Place, held, moved, shared_voxels, unlevel
 from semslam.stages.settings import SurfelConfig
 
@@ -30,12 +30,12 @@ _REACHES_M = (0.15, 0.1, 0.08, 0.06)
 _LEAST_SHARED = 0.15
 """Share of the smaller one's voxels that two keyframes must have in common."""
 _MIN_MATCHES = 30
-_WORST = 1.6
-"""Mean difference of two pictures, in standard deviations, above which the pair is left out."""
 _MOST_SIGMAS = 5.0
 """Motion that is farther off than this has less than half of its weight (Cauchy): slipping wheels, a parked robot."""
 _STILL = 1e-3
 """Metres and radians of a change that is no improvement any more."""
+_FIXED = 1e8
+"""Information that keeps the first keyframe where it is."""
 _FREE = 1e-3
 """Keeps what nothing ties solvable."""
 
@@ -132,7 +132,7 @@ def _tie(equations: _Equations, places: Sequence[Place], first: int, second: int
     one, other = places[first], places[second]
     if not (one.keyframe and other.keyframe):
         return False
-    if agreement(one.keyframe.sight, other.keyframe.sight, between(one.pose, other.pose)).mean > _WORST:
+    if agreement(one.keyframe.sight, other.keyframe.sight, between(one.pose, other.pose)).mean > WORST:
         return False
     there = _compare(equations, (first, one.keyframe, one.pose), (second, other.keyframe, other.pose), reach_m)
     back = _compare(equations, (second, other.keyframe, other.pose), (first, one.keyframe, one.pose), reach_m)
@@ -156,8 +156,8 @@ def _compare(
 def _level(equations: _Equations, places: Sequence[Place], index: int, config: SurfelConfig) -> None:
     """The robot stands upright on its floor; the first keyframe's place and heading are the map frame's."""
     tilt, height = config.tilt_noise_rad**-2, config.height_noise_m**-2
-    held = 1e8 if index == 0 else _FREE
-    weight = np.diag([tilt, tilt, held, held, held, height])
+    place = _FIXED if index == 0 else _FREE
+    weight = np.diag([tilt, tilt, place, place, place, height])
     error = unlevel(places[index].pose) if index else unlevel(places[0].pose) * [1, 1, 0, 0, 0, 1]
     equations.add((index,), weight, weight @ error)
 
@@ -174,7 +174,7 @@ def _move(equations: _Equations, places: Sequence[Place], index: int, bias: Floa
         x, y, turn = measured - bias * seconds
         noise, steady = noise_sigmas(config) ** 2 * seconds, seconds
     shift = before.pose[:3, :3] @ np.array([x, y, 0.0])
-    turned = before.pose[:3, :3] @ _about_z(turn)
+    turned = before.pose[:3, :3] @ rotation_from_vector([0.0, 0.0, turn])
     error = np.concatenate(
         [rotation_vector(place.pose[:3, :3] @ turned.T), place.pose[:3, 3] - before.pose[:3, 3] - shift]
     )
@@ -188,11 +188,6 @@ def _move(equations: _Equations, places: Sequence[Place], index: int, bias: Floa
     weight = np.diag([_FREE, _FREE, 1 / noise[2], 1 / noise[0], 1 / noise[1], _FREE]) / doubt
     weighted = jacobian.T @ weight
     equations.add((index - 1, index, equations.bias), weighted @ jacobian, weighted @ error)
-
-
-def _about_z(angle_rad: float) -> Floats:
-    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
-    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
 class _Equations:

@@ -20,7 +20,7 @@ from semslam.slam.estimator import View
 from semslam.slam.health import JUMP_M, JUMP_M_PER_S
 from semslam.slam.surfel.alignment import Fit, Target, between, change_between, nudged
 from semslam.slam.surfel.motion_prior import Expected, MotionPrior
-from semslam.slam.surfel.sight import Agreement, Sight, agreement
+from semslam.slam.surfel.sight import WORST, Agreement, Sight, agreement
 from semslam.slam.surfel.surfels import Surfels, surfels_of
 from semslam.stages.settings import SurfelConfig
 
@@ -63,8 +63,6 @@ that is not. So a pose from which little is seen of what is known must be all th
 _TOO_FEW = 0.04
 """Share of samples that must be found again, or the pictures have nothing in common."""
 _MIN_MATCHES = 40
-_WORST = 1.6
-"""Mean difference, in standard deviations, above which two pictures do not show the same place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,12 +143,12 @@ class Track:
         ):
             motion = None  # odometry that was set anew, not a robot
         expected = self.prior.expect(motion, seconds)
-        start = before.pose @ matrix_of(expected.motion)
+        start = before.pose @ expected.motion.matrix
         if not any(len(place.voxels) for place in self.places):  # the first picture: there is nothing to find it in
             return self._remember(keyframe, start, seconds, motion, linked=keyframe is not None)
         starts = [start]
         if seconds > _PAUSE_S and motion is not None:  # a parked robot's odometry rests, and its errors with it
-            starts += [before.pose @ matrix_of(motion), before.pose]
+            starts += [before.pose @ motion.matrix, before.pose]
         found = self._find(keyframe, starts, self.open + expected.covariance, linked=True)
         if found is None:
             return self._go_on(keyframe, start, seconds, motion, expected)
@@ -246,7 +244,7 @@ class Search:
         pose = self._beside(pose)
         pose, fit = self._refined(pose, _ROUNDS, coarse=False)
         seen = self._agreement(pose)
-        if len(fit) < _MIN_MATCHES or self._too_few(seen) or seen.mean > _WORST:
+        if len(fit) < _MIN_MATCHES or self._too_few(seen) or seen.mean > WORST:
             return None
         return pose, fit.equations(pose[:3, 3])[0]
 
@@ -257,13 +255,13 @@ class Search:
         step = max(_HEADING_STEP_RAD, 2 * open_rad / (_MOST_STARTS - 1))
         half = math.ceil(open_rad / step)
         turns = range(-half, half + 1)
-        costs = {turn: self._cost(self._start @ matrix_of(SE2(0.0, 0.0, turn * step))) for turn in turns}
+        costs = {turn: self._cost(self._start @ SE2(0.0, 0.0, turn * step).matrix) for turn in turns}
         kept = {0, *list(turns)[:: max(1, len(turns) // _EVENLY)]} if len(turns) > _EVENLY else {0}
         best: list[int] = []
         for turn in sorted(turns, key=lambda one: (costs[one], abs(one))):
             if len(best) < max(_STARTS_KEPT, len(turns) // 4) and all(abs(turn - other) > 1 for other in best):
                 best.append(turn)
-        turned = [self._start @ matrix_of(SE2(0.0, 0.0, turn * step)) for turn in sorted(kept | set(best))]
+        turned = [self._start @ SE2(0.0, 0.0, turn * step).matrix for turn in sorted(kept | set(best))]
         return [*turned, *self._others]
 
     def _beside(self, pose: Matrix) -> Matrix:
@@ -319,14 +317,6 @@ class Search:
 
     def _too_few(self, seen: Agreement) -> bool:
         return seen.looked_up < _TOO_FEW * 2 * len(self._keyframe.sight.points) + 1
-
-
-def matrix_of(pose: SE2) -> Matrix:
-    """A pose on the floor as a matrix."""
-    matrix = np.eye(4)
-    cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
-    matrix[:2] = [[cosine, -sine, 0.0, pose.x_m], [sine, cosine, 0.0, pose.y_m]]
-    return matrix
 
 
 def _voxels(points: Floats) -> NDArray[np.int64]:
