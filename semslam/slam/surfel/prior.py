@@ -27,7 +27,6 @@ from semslam.tables.parquet import TableFiles, made_by
 from semslam.tables.pictures import decode_depth, encode_depth
 from semslam.tables.spec import PLACES
 
-
 _COMMAND = "semslam run LOG --estimator surfel --out OUT"
 """What makes a map."""
 
