@@ -8,7 +8,8 @@ moves the truth into the map frame.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,10 @@ class Score:
     """Mean absolute heading error, wrapped."""
     ape_worst_m: float | None
     de_worst_deg: float | None
+    ok: float = 0.0
+    """Share of the keyframes with truth whose pose the estimator calls ok."""
+    ok_wrong: float | None = None
+    """Share of those that are farther off than `ok` promises; None if there is none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +87,23 @@ def score(truth: Track, estimate: Track) -> Score:
     distance, turn = found.distance_m, found.turn_deg
     summary = (distance.mean(), turn.mean(), distance.max(), turn.max())
     return Score(frames, len(found.frames) / frames, *(float(error) for error in summary))
+
+
+def trusted(found: Score, wrong: Errors, ok_frames: Iterable[int], ok_m: float, ok_deg: float) -> Score:
+    """With what became of the keyframes that the estimator calls ok: it promises that they are nearer than the bounds.
+
+    Args:
+        found: the score of the track.
+        wrong: the errors of the track.
+        ok_frames: keyframes that are called so.
+        ok_m: bound of the distance.
+        ok_deg: bound of the turn.
+    """
+    called = np.isin(wrong.frames, np.fromiter(ok_frames, np.int64))
+    if not called.any():
+        return found
+    beyond = (wrong.distance_m[called] > ok_m) | (wrong.turn_deg[called] > ok_deg)
+    return replace(found, ok=int(called.sum()) / found.frames, ok_wrong=float(beyond.mean()))
 
 
 def _from_first(track: Track, rows: NDArray[Any]) -> _FLOATS:

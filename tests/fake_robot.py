@@ -62,6 +62,8 @@ def localize(ctx: StageContext) -> None:
                 "y_m": y_m,
                 "heading_rad": heading_rad,
                 "source": ["inertial"] * FRAMES,
+                "verdict": ["ok"] * (FRAMES - 1) + ["lost"],
+                "covariance": [[1e-6, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1e-6]] * (FRAMES - 1) + [[]],
                 "peak": [None] * FRAMES,
                 "entropy_nats": [None] * FRAMES,
                 **{f"mode_{name}": empty for name in ("x_m", "y_m", "heading_rad", "probability")},

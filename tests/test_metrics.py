@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semslam.geometry.frames import SE2
-from semslam.metrics import Score, Track, chance, chance_errors, errors, score, standstill
+from semslam.metrics import Score, Track, chance, chance_errors, errors, score, standstill, trusted
 from semslam.slam.exchange import tum
 
 
@@ -30,6 +30,20 @@ def test_by_hand() -> None:
     estimate = {0: SE2(0, 0, 0), 1: SE2(4, 4, math.pi / 2), 2: SE2(2, 1, -math.pi + math.radians(30))}
     result = score(track_of({i: world_from_map @ pose for i, pose in truth.items()}), track_of(estimate))
     assert result == Score(3, 1.0, *(pytest.approx(v) for v in (2.0, 40.0, 5.0, 90.0)))
+
+
+def test_what_an_ok_is_worth() -> None:
+    """Of the keyframes called ok those count as wrong that are beyond either bound; others do not count."""
+    truth = track_of({i: SE2(float(i), 0, 0) for i in range(5)})
+    estimate = track_of(
+        {0: SE2(0, 0, 0), 1: SE2(1.1, 0, 0), 2: SE2(2, 0.4, 0), 3: SE2(3, 0, math.radians(3)), 4: SE2(9, 9, 1)}
+    )
+    plain, wrong = score(truth, estimate), errors(truth, estimate)
+    assert (plain.ok, plain.ok_wrong) == (0.0, None)
+    assert trusted(plain, wrong, [], 0.2, 2.0) == plain
+    found = trusted(plain, wrong, [0, 1, 2, 3], 0.2, 2.0)
+    assert (found.ok, found.ok_wrong, found.ape_m) == (0.8, 0.5, plain.ape_m)
+    assert trusted(plain, wrong, [0, 1, 2, 3], 0.5, 4.0).ok_wrong == 0.0
 
 
 def test_keyframes_without_a_pose_lower_the_coverage_only() -> None:

@@ -25,7 +25,7 @@ Capture = pytest.CaptureFixture[str]
 def test_every_estimator_is_scored_beside_luck_and_standing_still(world: World, capsys: Capture) -> None:
     """Four of five keyframes have a pose; the drift sideways is 0, 1, 2, 3 times the step."""
     make_log(world.logs, "a")
-    world.run(stages=ROBOT_STAGES, until="localize")
+    world.run("localize.estimators=paper,paper_visual,dead_reckoning", stages=ROBOT_STAGES, until="localize")
     assert run_command(["evaluate", str(world.out), "--json"], ROBOT_STAGES) == 0
     told = json.loads(capsys.readouterr().out)
     scores = {score["estimator"]: score for score in told["scores"]}
@@ -36,6 +36,10 @@ def test_every_estimator_is_scored_beside_luck_and_standing_still(world: World, 
         assert scores[name]["ape_m"] == pytest.approx(1.5 * drift)
         assert scores[name]["ape_worst_m"] == pytest.approx(3 * drift)
         assert scores[name]["de_deg"] == 0.0
+        assert scores[name]["ok"] == 0.8
+        assert scores[name]["ok_wrong"] == {"paper": 0.5, "paper_visual": 0.75, "dead_reckoning": 0.75}[name]
+    assert scores["chance"]["ok"] == 0.0
+    assert scores["chance"]["ok_wrong"] is None
     assert scores["standstill"]["ape_m"] == pytest.approx(2.0)
     assert scores["chance"]["ape_m"] > 2.0
     table = TableFiles(EVALUATION, [world.out / "results" / "evaluation.parquet"]).read()
@@ -53,8 +57,8 @@ def test_the_table_for_people(world: World, capsys: Capture) -> None:
     shown = capsys.readouterr()
     assert shown.err == "warning: `c` has no ground truth\n"
     lines = [line.split() for line in shown.out.splitlines()]
-    assert lines[0] == ["LOG", "ESTIMATOR", "FRAMES", "COVERAGE", "APE", "DE", "WORST", "APE", "WORST", "DE"]
-    assert lines[1] == ["a", "paper", "5", "80.0%", "0.150", "m", "0.00", "deg", "0.300", "m", "0.00", "deg"]
+    assert lines[0] == "LOG ESTIMATOR FRAMES COVERAGE APE DE WORST APE WORST DE OK OK WRONG".split()
+    assert lines[1] == "a paper 5 80.0% 0.150 m 0.00 deg 0.300 m 0.00 deg 80.0% 50.0%".split()
     assert lines[9] == ["mean", "of", "2", "paper", "10", *lines[1][3:]]
 
 

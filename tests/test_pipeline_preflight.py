@@ -40,6 +40,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 GOOD = ["--detector", "detector.onnx", "--classes", "classes.txt"]
+PAPER = [*GOOD, "--estimator", "paper"]
 
 
 @pytest.mark.parametrize(
@@ -52,9 +53,9 @@ GOOD = ["--detector", "detector.onnx", "--classes", "classes.txt"]
         ([*GOOD, "--set", "extract.select=chiar"], "names the class `chiar`", "did you mean `chair`?"),
         ([*GOOD, "--segmenter-encoder", "encoder.onnx"], "an image encoder and a mask decoder", "--segmenter-decoder"),
         ([*GOOD, "--set", "extract.side=98"], "`extract.side` is 98", "extract.side=99"),
-        ([*GOOD, "--set", "localize.paper.map_side=32"], "`localize.paper.map_side` is 32", "33"),
-        ([*GOOD, "--set", "localize.paper.side=10"], "`localize.paper.side` is 10", "11"),
-        ([*GOOD, "--set", "localize.paper.cell_m=0.2"], "no odd multiple of `extract.cell_m`", "0.3"),
+        ([*PAPER, "--set", "localize.paper.map_side=32"], "`localize.paper.map_side` is 32", "33"),
+        ([*PAPER, "--set", "localize.paper.side=10"], "`localize.paper.side` is 10", "11"),
+        ([*PAPER, "--set", "localize.paper.cell_m=0.2"], "no odd multiple of `extract.cell_m`", "0.3"),
         ([*GOOD, "--prior", "nowhere"], "`--prior nowhere` is no map made before", "results/LOG/surfel"),
         ([*GOOD, "--prior", "classes.txt", "--estimator", "paper"], "for the estimator `surfel`", "--estimator surfel"),
         (
@@ -64,7 +65,7 @@ GOOD = ["--detector", "detector.onnx", "--classes", "classes.txt"]
         ),
         ([*GOOD, "--prior", "logs"], "there is no `places.parquet`", "results/LOG/surfel"),
         ([*GOOD, "--prior", "classes.txt"], "classes.txt` is damaged", ""),
-        ([*GOOD, "--set", "localize.paper.update=learned"], "classes", "localize.paper"),
+        ([*PAPER, "--set", "localize.paper.update=learned"], "classes", "localize.paper"),
         (
             [*GOOD, "--estimator", "deepvo", "--set", "localize.deepvo.model=broken.onnx"],
             "is no ONNX file, or is damaged",

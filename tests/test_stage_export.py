@@ -37,6 +37,7 @@ def write_poses(path: Path, poses: list[tuple[float, float, float] | None]) -> N
     rows = {
         "frame": list(range(len(poses))), "stamp_nanos": [STAMP + i * 10**9 for i in range(len(poses))], **columns,
         "source": ["inertial" if pose else "none" for pose in poses], "peak": nothing, "entropy_nats": nothing,
+        "verdict": ["uncertain" if pose else "lost" for pose in poses], "covariance": lists,
         "mode_x_m": lists, "mode_y_m": lists, "mode_heading_rad": lists, "mode_probability": lists,
     }  # fmt: skip
     write_table(path, POSES, rows, META)
@@ -88,7 +89,7 @@ def test_trajectory_leaves_out_keyframes_without_a_pose(tmp_path: Path) -> None:
     rows = context.results(TRAJECTORY)["trajectory"].read()
     assert rows == {
         "frame": [0, 2], "stamp_nanos": [STAMP, STAMP + 2 * 10**9], "x_m": [0.0, 1.25], "y_m": [0.0, -0.5],
-        "heading_rad": [0.0, math.pi / 2],
+        "heading_rad": [0.0, math.pi / 2], "verdict": ["uncertain", "uncertain"],
     }  # fmt: skip
     lines = (context.folder / "shard-0" / "trajectory.tum").read_text().splitlines()
     assert lines[1].split()[0] == "1700000002.123456789"

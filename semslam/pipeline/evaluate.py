@@ -15,13 +15,14 @@ from typing import Any
 
 from semslam.errors import SemslamError
 from semslam.geometry.frames import SE2
-from semslam.metrics import Score, Track, chance, score, standstill
+from semslam.metrics import Score, Track, chance, errors, score, standstill, trusted
 from semslam.pipeline.cache import EntryIndex, table_files
 from semslam.pipeline.console import table
 from semslam.pipeline.context import check_inputs
 from semslam.pipeline.files import TEMPORARY
 from semslam.pipeline.folder import OutputFolder
 from semslam.pipeline.record import LogRecord, load_records
+from semslam.slam.verdict import OK
 from semslam.tables.parquet import TableFiles, write_table
 from semslam.tables.spec import EVALUATION, MOTION, OBSERVATIONS, POSES, TRUTH, Table
 
@@ -55,7 +56,7 @@ class Evaluation:
 
     def text(self) -> str:
         """For a terminal; with several logs, their mean as well."""
-        head = ["LOG", "ESTIMATOR", "FRAMES", "COVERAGE", "APE", "DE", "WORST APE", "WORST DE"]
+        head = ["LOG", "ESTIMATOR", "FRAMES", "COVERAGE", "APE", "DE", "WORST APE", "WORST DE", "OK", "OK WRONG"]
         rows = [_row(line) for line in (*self.lines, *_means(self.lines))]
         return table([head, *rows], left=(0, 1))
 
@@ -106,7 +107,7 @@ def _score_log(
         found.add(estimator)
         if _outdated(index, record, estimator):
             notes.append(f"poses of `{estimator}` for `{record.name}` are older than its observations; run again")
-        yield Line(record.name, estimator, score(truth, track))
+        yield Line(record.name, estimator, _judged(folder, index, record, estimator, truth, track))
     if DEAD_RECKONING not in found:
         motion = _rows(folder, index, record, MOTION, "", ("frame", "stamp_nanos", "dx_m", "dy_m", "dheading_rad"))
         if motion is None:
@@ -115,6 +116,17 @@ def _score_log(
             yield Line(record.name, DEAD_RECKONING, score(truth, compose(motion)))
     yield Line(record.name, CHANCE, chance(truth, _map_half_m(record), _SEED))
     yield Line(record.name, STANDSTILL, standstill(truth))
+
+
+def _judged(
+    folder: OutputFolder, index: EntryIndex, record: LogRecord, estimator: str, truth: Track, track: Track
+) -> Score:
+    """The score of a track, and what became of the poses that it calls ok."""
+    rows = _rows(folder, index, record, POSES, estimator, ("frame", "verdict")) or {"frame": [], "verdict": []}
+    called = [frame for frame, verdict in zip(rows["frame"], rows["verdict"], strict=True) if verdict == OK]
+    bounds = record.config[POSES.stage]
+    found = score(truth, track)
+    return trusted(found, errors(truth, track), called, bounds["ok_m"], math.degrees(bounds["ok_rad"]))
 
 
 def compose(motion: Mapping[str, Sequence[Any]]) -> Track:
@@ -201,13 +213,17 @@ def _means(lines: Sequence[Line]) -> Iterator[Line]:
                 _mean([one.de_deg for one in scores]),
                 _most([one.ape_worst_m for one in scores]),
                 _most([one.de_worst_deg for one in scores]),
+                sum(one.ok for one in scores) / len(scores),
+                _mean([one.ok_wrong for one in scores], [one.ok * one.frames for one in scores]),
             ),
         )
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known else None
+def _mean(values: Sequence[float | None], weights: Sequence[float] = ()) -> float | None:
+    """Of those that are known, weighted alike unless told otherwise; None without any."""
+    weighted = zip(values, weights or [1.0] * len(values), strict=True)
+    known = [(value, weight) for value, weight in weighted if value is not None]
+    return sum(value * weight for value, weight in known) / sum(weight for _, weight in known) if known else None
 
 
 def _most(values: Sequence[float | None]) -> float | None:
@@ -222,6 +238,8 @@ def _row(line: Line) -> list[str]:
         f"{one.frames:,}",
         f"{one.coverage:.1%}",
         *(_metres(one.ape_m), _degrees(one.de_deg), _metres(one.ape_worst_m), _degrees(one.de_worst_deg)),
+        f"{one.ok:.1%}",
+        "-" if one.ok_wrong is None else f"{one.ok_wrong:.1%}",
     ]
 
 

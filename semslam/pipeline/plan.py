@@ -26,7 +26,6 @@ from semslam.pipeline.discover import Log
 from semslam.pipeline.files import canonical_json
 from semslam.pipeline.record import TaskRecord, task_name
 from semslam.stages.contract import Stage
-from semslam.tables.spec import SPEC_VERSION
 
 ABSENT = "absent"
 """Stands in a key for the digest of an optional table that the log does not have, or for a library's version."""
@@ -173,7 +172,7 @@ class Planner:
             "version": stage.version,
             "variant": task.variant,
             "config": self._settings_of(task),
-            "spec": SPEC_VERSION,
+            "spec": max(table.version for table in (*stage.reads, *stage.writes)),
             "libraries": {name: library_version(name) for name in stage.libraries},
         }
         if any(path.lower().endswith(".onnx") for _, path in file_settings(self.task_config(task), stage.name)):

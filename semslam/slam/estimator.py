@@ -81,6 +81,8 @@ class PoseEstimate:
     """Entropy of that field."""
     modes: tuple[Mode, ...] = ()
     """Its best modes, best first; empty without a field or if it is flat."""
+    covariance: tuple[float, ...] | None = None
+    """3 x 3 of x, y and heading along the map's axes, m and rad, row by row; None if the estimator tells none."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from semslam.stages.settings import ExportConfig
 from semslam.tables.parquet import TableFileWriter, write_table
 from semslam.tables.spec import CELLS, PLACES, POSES, TRAJECTORY
 
-_POSE = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")
+_POSE = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad", "verdict")
 _FILES = 5
 
 Columns = Mapping[str, list[Any]]
@@ -80,7 +80,7 @@ def _write_trajectory(shard: ShardWriter, track: Columns, poses: TableSource) ->
     kept = [i for i, x in enumerate(track["x_m"]) if x is not None]
     posed = {name: [track[name][i] for i in kept] for name in _POSE}
     shard.table(TRAJECTORY, dict(poses.meta)).append(posed)
-    lines = tum(zip(*(posed[name] for name in _POSE[1:]), strict=True))
+    lines = tum(zip(*(posed[name] for name in _POSE[1:-1]), strict=True))
     shard.path("trajectory.tum").write_text(lines, encoding="ascii", newline="\n")
 
 

@@ -34,6 +34,7 @@ from semslam.slam.estimator import Belief, PoseEstimate, Step
 from semslam.slam.evidence import Evidence, Snapshot
 from semslam.slam.health import TrackHealth
 from semslam.slam.registry import NEEDS_VIEWS, WHOLE_LOGS, WITHOUT_MOTION, open_estimator, open_whole
+from semslam.slam.verdict import verdict_of
 from semslam.slam.views import view_of
 from semslam.stages.contract import FinishedShard, ShardWriter, StageContext, TableSink, TableSource, row_shards
 from semslam.stages.settings import LocalizeConfig
@@ -120,7 +121,8 @@ class _Track:
     """A pose track and the map that grows along it."""
 
     def __init__(self, ctx: StageContext, meta: Mapping[str, Any]) -> None:
-        self._every = int(ctx.config.snapshot_every)
+        self._config: LocalizeConfig = ctx.config
+        self._every = self._config.snapshot_every
         self._classes = tuple(meta["classes"])
         self._cell_m, self._side = float(meta["cell_m"]), int(meta["side"])
         self._evidence = Evidence(self._cell_m, self._side)
@@ -150,7 +152,8 @@ class _Track:
         if estimate.map_from_robot is not None:
             self._lay(step, estimate.map_from_robot, shard)
         self._steps += 1
-        tables["poses"].append(_pose_row(step, estimate))
+        verdict = verdict_of(estimate, self._config.ok_m, self._config.ok_rad)
+        tables["poses"].append(_pose_row(step, estimate, verdict))
         if self._steps % self._every == 0 or last:
             tables["snapshots"].append(_snapshot_row(step, self.snapshot()))
 
@@ -312,7 +315,7 @@ def _sparse(belief: Belief) -> Snapshot:
     return Snapshot(rows, columns, belief.cell_m, *origin, cells.astype(np.int64), weights)
 
 
-def _pose_row(step: Step, estimate: PoseEstimate) -> dict[str, list[Any]]:
+def _pose_row(step: Step, estimate: PoseEstimate, verdict: str) -> dict[str, list[Any]]:
     pose, modes = estimate.map_from_robot, estimate.modes
     row = {
         "frame": step.frame,
@@ -321,6 +324,8 @@ def _pose_row(step: Step, estimate: PoseEstimate) -> dict[str, list[Any]]:
         "y_m": pose.y_m if pose else None,
         "heading_rad": pose.heading_rad if pose else None,
         "source": estimate.source,
+        "verdict": verdict,
+        "covariance": list(estimate.covariance or ()),
         "peak": estimate.peak,
         "entropy_nats": estimate.entropy_nats,
         "mode_x_m": [mode.map_from_robot.x_m for mode in modes],

@@ -228,7 +228,7 @@ class LocalizeConfig:
     """From observations and motion to poses and maps."""
 
     estimators: tuple[str, ...] = setting(
-        ("paper", "paper_visual", "dead_reckoning"),
+        ("surfel", "dead_reckoning"),
         choices=("surfel", "paper", "paper_visual", "dead_reckoning", "mapnet", "deepvo", "orb_rgbd"),
     )
     """Estimators to run; each gives its own track and map. surfel aligns the depth images of the whole log and takes
@@ -252,6 +252,10 @@ class LocalizeConfig:
     """Modes of the pose field kept a frame."""
     shard_frames: int = setting(200, low=1, high=100000)
     """Keyframes a shard: what a killed run loses at most."""
+    ok_m: float = setting(0.1, low=1e-6, high=1e6)
+    """A pose is `ok` if it is nearer to the truth than this with 95 % probability, metres, and ..."""
+    ok_rad: float = setting(0.035, low=1e-6, high=10.0)
+    """... its heading than this, radians: 2 degrees."""
 
     @property
     def uses_map_update(self) -> bool:

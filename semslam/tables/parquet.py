@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from semslam.errors import SemslamError
-from semslam.tables.spec import SPEC_VERSION, Column, Table
+from semslam.tables.spec import Column, Table
 
 _ARROW = {
     "bool": pa.bool_(),
@@ -56,9 +56,9 @@ def made_by(command: str) -> Iterator[None]:
 
 
 def arrow_schema(table: Table, meta: Mapping[str, Any] | None = None) -> pa.Schema:
-    """The Arrow schema of `table`, with `meta` and the specification version in its metadata."""
+    """The Arrow schema of `table`, with `meta` and the table's version in its metadata."""
     fields = [pa.field(c.name, _ARROW[c.type], nullable=c.null) for c in table.columns]
-    header = {"table": table.name, "spec": SPEC_VERSION, "meta": dict(meta or {})}
+    header = {"table": table.name, "spec": table.version, "meta": dict(meta or {})}
     return pa.schema(fields, metadata={_KEY: json.dumps(header, sort_keys=True, separators=(",", ":")).encode()})
 
 
@@ -236,10 +236,10 @@ def _header(file: pq.ParquetFile, path: Path, table: Table) -> dict[str, Any]:
         header: dict[str, Any] = json.loads(raw) if raw else {}
     except ValueError as error:
         raise _damaged(path, error) from error
-    if header.get("table") != table.name or header.get("spec") != SPEC_VERSION:
-        found = f"table `{header.get('table')}` of specification {header.get('spec')}" if header else "no semslam table"
+    if header.get("table") != table.name or header.get("spec") != table.version:
+        found = f"table `{header.get('table')}` of version {header.get('spec')}" if header else "no semslam table"
         raise TableError(
-            f"Table file `{path}` holds {found}, expected table `{table.name}` of specification {SPEC_VERSION}",
+            f"Table file `{path}` holds {found}, expected table `{table.name}` of version {table.version}",
             hint="use another `--out` folder, or the version of semslam that wrote it",
         )
     return header

@@ -8,9 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-SPEC_VERSION = 1
-"""Version of the tables; stored in every file and refused when another one is read."""
-
 
 @dataclass(frozen=True)
 class Column:
@@ -31,6 +28,8 @@ class Table:
     number: int
     stage: str
     columns: tuple[Column, ...]
+    version: int = 1
+    """Rises with every change of the columns; stored in every file and refused when another one is read."""
 
 
 TYPES = (
@@ -209,6 +208,13 @@ POSES = Table(
         _c("y_m", "float64", "m", "likewise", null=True),
         _c("heading_rad", "float64", "rad", "direction of the robot's x axis in the map frame, (-pi, pi]", null=True),
         _c("source", "string", "", "start, visual, inertial or none"),
+        _c("verdict", "string", "", "ok, uncertain or lost"),
+        _c(
+            "covariance",
+            "list<float64>",
+            "m, rad",
+            "3x3 matrix of x, y and heading along the map's axes, row by row; empty if the estimator tells none",
+        ),
         _c("peak", "float64", "", "probability of the best pose bin; null without a pose field", null=True),
         _c("entropy_nats", "float64", "nat", "entropy of the pose field; null without one", null=True),
         _c("mode_x_m", "list<float64>", "m", "top modes of the pose field, best first; empty without one"),
@@ -216,6 +222,7 @@ POSES = Table(
         _c("mode_heading_rad", "list<float64>", "rad", "likewise"),
         _c("mode_probability", "list<float64>", "", "probability of each mode's bin"),
     ),
+    version=2,
 )
 
 SNAPSHOTS = Table(
@@ -264,7 +271,9 @@ TRAJECTORY = Table(
         _c("x_m", "float64", "m", "position of the robot in the map frame"),
         _c("y_m", "float64", "m", "likewise"),
         _c("heading_rad", "float64", "rad", "direction of the robot's x axis in the map frame, (-pi, pi]"),
+        _c("verdict", "string", "", "ok or uncertain"),
     ),
+    version=2,
 )
 
 EVALUATION = Table(
@@ -286,7 +295,16 @@ EVALUATION = Table(
         _c("de_deg", "float64", "deg", "mean absolute heading error; null without poses", null=True),
         _c("ape_worst_m", "float64", "m", "largest position error", null=True),
         _c("de_worst_deg", "float64", "deg", "largest heading error", null=True),
+        _c("ok", "float64", "", "share of the keyframes with truth whose verdict is ok, 0 to 1"),
+        _c(
+            "ok_wrong",
+            "float64",
+            "",
+            "share of those that are farther off than `localize.ok_m` or `localize.ok_rad`; null if none is ok",
+            null=True,
+        ),
     ),
+    version=2,
 )
 
 SPLITS = Table(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +18,21 @@ from numpy.typing import NDArray
 from semslam.geometry.frames import SE2, planar
 from semslam.slam.checkpoint import as_array, pack, unpack
 from semslam.slam.estimator import INERTIAL, NONE, START, VISUAL, Mode, PoseEstimate, Step
+from semslam.slam.surfel.motion_prior import MotionPrior
 from semslam.slam.surfel.prior import Grid, Seen, place_row, read_prior, submap_of
 from semslam.slam.surfel.registration import AMBIGUOUS, Placement, place_in
+from semslam.slam.surfel.rejoining import rejoined, without_specks
 from semslam.slam.surfel.sight import Sight
-from semslam.slam.surfel.smoothing import smooth
+from semslam.slam.surfel.smoothing import Smoothed, smooth
 from semslam.slam.surfel.surfels import Surfels
-from semslam.slam.surfel.tracking import Keyframe, Place, Track, moved, placed
+from semslam.slam.surfel.tracking import SHORTEST_S, Keyframe, Place, Track, moved, placed
 from semslam.stages.settings import SurfelConfig
 
 _MODES = 3
 """Ways to lie on a map made before that are told, at most."""
 
 _Arrays = dict[str, NDArray[Any]]
+Floats = NDArray[np.float64]
 
 
 class SurfelEstimator:
@@ -50,6 +54,7 @@ class SurfelEstimator:
         self._kept = 0  # keyframes that earlier parts hold
         self._places: list[Place] = []
         self._sources: list[str] = []
+        self._covariances: list[Floats] = []
         self._placement: Placement | None = None
 
     def step(self, step: Step) -> None:
@@ -65,11 +70,12 @@ class SurfelEstimator:
         """The poses of all keyframes; `watch` hears of each round over them."""
         if not self._track.places:
             return []
-        smoothed = smooth(self._track.places, self._track.prior.bias, self._config, watch)
+        smoothed = self._smoothed(watch)
         # Of the first one's tilt nothing: what is upright all keyframes tell together.
         start = planar(smoothed.places[0].pose).inverse().matrix
         self._places = [moved(place, start @ place.pose) for place in smoothed.places]
-        self._sources = _sources(self._places, smoothed.together)
+        self._sources = _sources(self._places, smoothed.parts)
+        self._covariances = _covariances(smoothed, self._track.prior)
         if self._prior is None:
             self._sources[0] = START
             return self._told()
@@ -77,6 +83,15 @@ class SurfelEstimator:
         own = submap_of([place for _, place, _ in known], [seen for _, _, seen in known], self._grid)
         self._placement = place_in(own, self._prior)
         return self._laid(self._placement)
+
+    def _smoothed(self, watch: Callable[[int], None] | None) -> Smoothed:
+        """All keyframes aligned, and parts that nothing ties to the first one looked for in its map."""
+        walked = without_specks(self._track.places)
+        smoothed = smooth(walked, self._track.prior.bias, self._config, watch)
+        if len(smoothed.parts) < 2:
+            return smoothed
+        places = rejoined(smoothed, self._seen, self._grid)
+        return smooth(places, smoothed.bias, self._config) if places else smoothed
 
     def _known(self) -> Iterator[tuple[int, Place, Seen]]:
         """Number, place and observation of keyframes whose place pictures tell."""
@@ -87,9 +102,11 @@ class SurfelEstimator:
 
     def _told(self) -> list[PoseEstimate]:
         """The poses as they stand."""
+        known = [tuple(error.ravel().tolist()) for error in self._covariances]
+        errors: list[tuple[float, ...] | None] = [*known] or [None] * len(self._places)
         return [
-            PoseEstimate(None if source == NONE else planar(place.pose), source)
-            for place, source in zip(self._places, self._sources, strict=True)
+            PoseEstimate(None, NONE) if source == NONE else PoseEstimate(planar(place.pose), source, covariance=error)
+            for place, source, error in zip(self._places, self._sources, errors, strict=True)
         ]
 
     def _laid(self, placement: Placement) -> list[PoseEstimate]:
@@ -102,6 +119,11 @@ class SurfelEstimator:
         if found is None:
             told = modes if placement.verdict == AMBIGUOUS else [()] * len(modes)
             return [PoseEstimate(None, NONE, modes=some) for some in told]
+        error = placement.proposals[0].covariance
+        self._covariances = [
+            _carried(found, error, planar(place.pose), own)
+            for place, own in zip(self._places, self._covariances, strict=False)
+        ]
         self._places = [moved(place, found.matrix @ place.pose) for place in self._places]
         return [replace(one, modes=some) for one, some in zip(self._told(), modes, strict=True)]
 
@@ -139,6 +161,7 @@ class SurfelEstimator:
         prior = self._track.prior
         arrays: _Arrays = {"bias": prior.bias, "covariance": prior.covariance, "speed": prior.speed}
         arrays["open"] = self._track.open
+        arrays["group"] = np.array([self._track.group, self._track.parked])
         arrays["frames"] = np.array([self._frames[index] for index in new], np.int64)
         arrays["stamps"] = np.array([self._stamps[index] for index in new], np.int64)
         kept = {str(index): as_array(_packed(self._track.places[index], self._seen[index])) for index in new}
@@ -152,6 +175,7 @@ class SurfelEstimator:
             prior = self._track.prior
             prior.bias, prior.covariance, prior.speed = arrays["bias"], arrays["covariance"], arrays["speed"]
             self._track.open = arrays["open"]
+            self._track.group, self._track.parked = int(arrays["group"][0]), bool(arrays["group"][1])
             for frame, stamp in zip(arrays["frames"].tolist(), arrays["stamps"].tolist(), strict=True):
                 place, seen = _unpacked(arrays[str(len(self._stamps))].tobytes())
                 self._track.places.append(place)
@@ -161,11 +185,12 @@ class SurfelEstimator:
         self._kept = len(self._stamps)
 
 
-def _sources(places: Sequence[Place], together: Sequence[bool]) -> list[str]:
+def _sources(places: Sequence[Place], parts: Sequence[Sequence[int]]) -> list[str]:
     """Where poses come from: pictures that are tied to the first, else unbroken motion from there, else nowhere."""
     sources: list[str] = []
-    for place, tied in zip(places, together, strict=True):
-        if tied:
+    tied = set(parts[0]) if parts else set()
+    for index, place in enumerate(places):
+        if index in tied:
             sources.append(VISUAL)
         elif not sources or (place.motion is not None and sources[-1] != NONE):
             sources.append(INERTIAL)
@@ -174,13 +199,42 @@ def _sources(places: Sequence[Place], together: Sequence[bool]) -> list[str]:
     return sources
 
 
+def _covariances(smoothed: Smoothed, prior: MotionPrior) -> list[Floats]:
+    """(3, 3) of every pose; of those that nothing ties to the first one, what motion leaves open since the last that
+    is; empty if nothing was aligned."""
+    if not smoothed.covariances:
+        return []
+    tied = set(smoothed.parts[0]) if smoothed.parts else {0}
+    found: list[Floats] = [smoothed.covariances[0]]
+    for index, (before, place) in enumerate(pairwise(smoothed.places), 1):
+        if index in tied:
+            found.append(smoothed.covariances[index])
+            continue
+        step = prior.expect(place.motion, max(place.seconds, SHORTEST_S)).covariance
+        turn = np.eye(3)
+        turn[:2, :2] = before.pose[:2, :2]
+        x, y = (place.pose - before.pose)[:2, 3]
+        lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+        found.append(np.asarray(lever @ found[-1] @ lever.T + turn @ step @ turn.T))
+    return found
+
+
+def _carried(other_from_own: SE2, error: Floats, own: SE2, own_error: Floats) -> Floats:
+    """Covariance (3, 3) of a pose in another map, from those of the map's place there and of the pose in its own."""
+    turn = np.eye(3)
+    turn[:2, :2] = other_from_own.matrix[:2, :2]
+    x, y = turn[:2, :2] @ [own.x_m, own.y_m]
+    lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+    return np.asarray(lever @ error @ lever.T + turn @ own_error @ turn.T)
+
+
 def _packed(place: Place, seen: Seen) -> bytes:
     motion = place.motion
     arrays: _Arrays = {
         "pose": place.pose,
         "seconds": np.array(place.seconds),
         "motion": np.array([] if motion is None else [motion.x_m, motion.y_m, motion.heading_rad]),
-        "linked": np.array(place.linked),
+        "linked": np.array([place.linked, place.group]),
         "cells": seen.cells,
         "weights": seen.weights,
     }
@@ -198,5 +252,7 @@ def _unpacked(packed: bytes) -> tuple[Place, Seen]:
         surfels = Surfels(*(arrays[name].astype(np.float64) for name in ("points", "normals", "sigma_m")))
         keyframe = Keyframe(surfels, Sight.from_arrays(arrays))
     motion = SE2(*arrays["motion"].tolist()) if arrays["motion"].size else None
-    place = placed(keyframe, arrays["pose"], arrays["seconds"].item(), motion, linked=arrays["linked"].item())
+    linked, group = arrays["linked"].tolist()
+    seconds = arrays["seconds"].item()
+    place = placed(keyframe, arrays["pose"], seconds, motion, linked=bool(linked), group=group)
     return place, Seen(arrays["cells"], arrays["weights"])

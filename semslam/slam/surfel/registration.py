@@ -18,6 +18,7 @@ from semslam.geometry.frames import SE2, planar
 from semslam.slam.surfel.alignment import Target, between, nudged
 from semslam.slam.surfel.semantic_field import Candidate, ClassMap, candidates
 from semslam.slam.surfel.sight import Agreement, agreement
+from semslam.slam.surfel.smoothing import DOUBT
 from semslam.slam.surfel.surfels import Surfels
 from semslam.slam.surfel.tracking import Keyframe, Place, moved, shared_voxels, unlevel
 
@@ -75,6 +76,8 @@ class Proposal:
     """Log likelihood ratio of a sample that is found again: right pose against wrong one."""
     seen: float
     """Share of samples that are, and are not hidden. It is no evidence: a wrong pose may see more."""
+    covariance: Floats
+    """(3, 3) of its x, y and heading along the other map's axes, if it is the right way."""
     probability: float = 0.0
     """Among all proposals."""
 
@@ -125,14 +128,14 @@ def _proposal(asked: Sequence[Place], known: Sequence[Place], target: Target, gu
         weight = np.diag([level, level, 1e-6, 1e-6, 1e-6, height])
         shift = nudged(shift, np.asarray(-np.linalg.solve(hessian + weight, gradient + weight @ unlevel(shift))))
     seen, samples = _compared(asked, known, shift)
-    told = seen.looked_up - seen.hidden
-    return Proposal(planar(shift), guess.score, _likeness(seen), told / max(1, samples))
+    keep = np.ix_([3, 4, 2], [3, 4, 2])
+    covariance = np.asarray(DOUBT * np.linalg.inv(hessian + weight)[keep], np.float64)
+    return Proposal(planar(shift), guess.score, _likeness(seen), seen.told / max(1, samples), covariance)
 
 
 def _likeness(seen: Agreement) -> float:
     """Log likelihood ratio of a sample; that of nothing but strangers if there is none."""
-    told = seen.looked_up - seen.hidden
-    strangers = seen.strangers / told if told else 1.0
+    strangers = seen.strangers / seen.told if seen.told else 1.0
     fits = math.log((1.0 - _STRANGERS_RIGHT) / (1.0 - _STRANGERS_WRONG))
     return (1.0 - strangers) * fits + strangers * math.log(_STRANGERS_RIGHT / _STRANGERS_WRONG)
 

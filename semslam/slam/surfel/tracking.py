@@ -20,7 +20,7 @@ from semslam.slam.estimator import View
 from semslam.slam.health import JUMP_M, JUMP_M_PER_S
 from semslam.slam.surfel.alignment import Fit, Target, between, change_between, nudged
 from semslam.slam.surfel.motion_prior import Expected, MotionPrior
-from semslam.slam.surfel.sight import WORST, Agreement, Sight, agreement
+from semslam.slam.surfel.sight import Agreement, Sight, agreement
 from semslam.slam.surfel.surfels import Surfels, surfels_of
 from semslam.stages.settings import SurfelConfig
 
@@ -63,6 +63,10 @@ that is not. So a pose from which little is seen of what is known must be all th
 _TOO_FEW = 0.04
 """Share of samples that must be found again, or the pictures have nothing in common."""
 _MIN_MATCHES = 40
+_WIDE_M, _WIDE_RAD = 0.2, 0.35
+"""Standard deviations of motion above which pictures alone must tell where a robot is ..."""
+_LOST_M, _LOST_RAD = 0.5, 0.6
+"""... and above which one of them may err."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,19 +109,24 @@ class Place:
     """Those with surfels, rising."""
     middle: Floats
     """(3,) of its surfels, in the map frame; NaN without any."""
+    group: int = 0
+    """Keyframes of different groups may lie where they do by mistake: a robot that did not know where it was found
+    itself by few pictures."""
 
 
-def placed(keyframe: Keyframe | None, pose: Matrix, seconds: float, motion: SE2 | None, *, linked: bool) -> Place:
+def placed(
+    keyframe: Keyframe | None, pose: Matrix, seconds: float, motion: SE2 | None, *, linked: bool, group: int = 0
+) -> Place:
     """A keyframe put somewhere."""
     if keyframe is None or not len(keyframe.surfels):
-        return Place(keyframe, pose, seconds, motion, linked, np.zeros(0, np.int64), np.full(3, np.nan))
+        return Place(keyframe, pose, seconds, motion, linked, np.zeros(0, np.int64), np.full(3, np.nan), group)
     points = keyframe.surfels.moved(pose).points
-    return Place(keyframe, pose, seconds, motion, linked, _voxels(points), points.mean(0))
+    return Place(keyframe, pose, seconds, motion, linked, _voxels(points), points.mean(0), group)
 
 
 def moved(place: Place, pose: Matrix) -> Place:
     """The same keyframe somewhere else."""
-    return placed(place.keyframe, pose, place.seconds, place.motion, linked=place.linked)
+    return placed(place.keyframe, pose, place.seconds, place.motion, linked=place.linked, group=place.group)
 
 
 class Track:
@@ -132,6 +141,10 @@ class Track:
         self.prior = MotionPrior(config)
         self.open = np.zeros((3, 3))
         """Covariance of what motion alone has told since a pose was seen."""
+        self.parked = False
+        """Whether the robot may have been parked, and carried away, since then."""
+        self.group = 0
+        """Of the next place."""
 
     def step(self, keyframe: Keyframe | None, motion: SE2 | None, seconds: float) -> Place:
         """Take the next keyframe; `seconds` since the one before, at which `motion` began."""
@@ -155,7 +168,9 @@ class Track:
         if held(found[1]) < HELD_M**-2:  # along a corridor motion tells the way; across it the walls do
             self.open = self.open + expected.covariance
             return self._remember(keyframe, found[0], seconds, motion, linked=False)
-        self.open = np.zeros((3, 3))
+        if _lost(self.open + expected.covariance) or self.parked:
+            self.group += 1
+        self.open, self.parked = np.zeros((3, 3)), False
         pose, hessian = found
         if before.linked:
             seen = planar(between(before.pose, pose))
@@ -171,12 +186,13 @@ class Track:
         found = self._find(keyframe, [start], expected.covariance, linked=False)
         if found is None:
             self.open = self.open + expected.covariance
+        self.parked |= seconds > _PAUSE_S
         return self._remember(keyframe, start if found is None else found[0], seconds, motion, linked=False)
 
     def _remember(
         self, keyframe: Keyframe | None, pose: Matrix, seconds: float, motion: SE2 | None, *, linked: bool
     ) -> Place:
-        place = placed(keyframe, pose, seconds, motion, linked=linked)
+        place = placed(keyframe, pose, seconds, motion, linked=linked, group=self.group)
         self.places.append(place)
         return place
 
@@ -198,6 +214,11 @@ class Track:
         others = [index for index in shared if self.places[index].linked == linked]
         others.sort(key=lambda index: (-shared[index], index))
         return [self.places[index] for index in others[: self._config.neighbours]]
+
+
+def _lost(covariance: Floats) -> bool:
+    """Whether motion leaves so much open that a single keyframe may be found in the wrong place."""
+    return bool(covariance[:2, :2].max() > _LOST_M**2 or covariance[2, 2] > _LOST_RAD**2)
 
 
 def shared_voxels(places: Sequence[Place], place: Place) -> dict[int, int]:
@@ -229,6 +250,7 @@ class Search:
         counts = [len(view.sight.points) for view in views]
         self._samples = counts[0] * (len(counts) - 1) + sum(counts[1:])
         self._start, self._others = starts[0], starts[1:]
+        self._wide = len(starts) > 1 or bool(covariance[:2, :2].max() > _WIDE_M**2 or covariance[2, 2] > _WIDE_RAD**2)
         self._target = Target(Surfels.joined([other.surfels.moved(pose) for other, pose in known]))
         self._sigma_m = math.sqrt(max(covariance[0, 0], covariance[1, 1]))
         self._sigma_rad = math.sqrt(covariance[2, 2])
@@ -244,7 +266,7 @@ class Search:
         pose = self._beside(pose)
         pose, fit = self._refined(pose, _ROUNDS, coarse=False)
         seen = self._agreement(pose)
-        if len(fit) < _MIN_MATCHES or self._too_few(seen) or seen.mean > WORST:
+        if len(fit) < _MIN_MATCHES or self._too_few(seen) or not seen.same_place(self._samples, sure=self._wide):
             return None
         return pose, fit.equations(pose[:3, 3])[0]
 

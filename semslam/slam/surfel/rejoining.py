@@ -1,0 +1,55 @@
+"""Parts of a log that nothing ties together: the robot was carried, the camera covered, the odometry set anew.
+
+Each part has a map of its own, which is laid on that of the others as a log is laid on a map made before
+(`registration`), without a first guess. Where that is not sure the part stays as it is.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+from semslam.slam.surfel.prior import Grid, Seen, submap_of
+from semslam.slam.surfel.registration import Submap, place_in
+from semslam.slam.surfel.smoothing import Smoothed
+from semslam.slam.surfel.tracking import Place, moved
+
+_LEAST = 5
+"""Keyframes of a part that is looked for: fewer show too little to be sure."""
+
+
+def rejoined(smoothed: Smoothed, seen: Sequence[Seen], grid: Grid) -> list[Place] | None:
+    """All places, with the parts that were found laid where they belong; None if none was.
+
+    `seen`: the observation of each.
+    """
+    main, *others = smoothed.parts
+    places, whole = list(smoothed.places), list(main)
+    for part in sorted(others, key=len, reverse=True):
+        if len(part) < _LEAST:
+            break
+        found = place_in(_map(places, seen, grid, part), _map(places, seen, grid, whole)).other_from_own
+        if found is not None:
+            for index in part:
+                place = moved(places[index], found.matrix @ places[index].pose)
+                places[index] = replace(place, group=places[main[0]].group)
+            whole += part
+    return places if len(whole) > len(main) else None
+
+
+def without_specks(places: Sequence[Place]) -> list[Place]:
+    """Groups of fewer keyframes than can be looked for become part of the one before, and their links are forgotten:
+    alignment has to find them again."""
+    sizes = Counter(place.group for place in places if len(place.voxels))
+    kept, group = [], places[0].group
+    for place in places:
+        large = place.group == places[0].group or sizes[place.group] >= _LEAST
+        group = place.group if large else group
+        kept.append(replace(place, group=group, linked=place.linked and large))
+    return kept
+
+
+def _map(places: Sequence[Place], seen: Sequence[Seen], grid: Grid, part: Sequence[int]) -> Submap:
+    rising = sorted(part)
+    return submap_of([places[index] for index in rising], [seen[index] for index in rising], grid)
