@@ -57,9 +57,10 @@ def test_the_table_for_people(world: World, capsys: Capture) -> None:
     shown = capsys.readouterr()
     assert shown.err == "warning: `c` has no ground truth\n"
     lines = [line.split() for line in shown.out.splitlines()]
-    assert lines[0] == "LOG ESTIMATOR FRAMES COVERAGE APE DE WORST APE WORST DE OK OK WRONG".split()
-    assert lines[1] == "a paper 5 80.0% 0.150 m 0.00 deg 0.300 m 0.00 deg 80.0% 50.0%".split()
-    assert lines[9] == ["mean", "of", "2", "paper", "10", *lines[1][3:]]
+    head, first, *others = lines
+    assert " ".join(head) == "LOG ESTIMATOR FRAMES COVERAGE APE DE WORST APE WORST DE OK OK WRONG"
+    assert " ".join(first) == "a paper 5 80.0% 0.150 m 0.00 deg 0.300 m 0.00 deg 80.0% 50.0%"
+    assert others[7] == ["mean", "of", "2", "paper", "10", *first[3:]]
 
 
 def test_dead_reckoning_is_there_without_being_run(world: World, capsys: Capture) -> None:

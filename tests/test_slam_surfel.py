@@ -22,6 +22,7 @@ from semslam.slam.surfel.semantic_field import ClassMap, candidates
 from semslam.slam.surfel.sight import Sight, agreement
 from semslam.slam.surfel.surfels import surfels_of
 from semslam.slam.surfel.tracking import Keyframe
+from semslam.slam.verdict import OK, UNCERTAIN, verdict_of
 from semslam.stages import localize
 from semslam.stages.contract import FinishedShard
 from semslam.stages.settings import LocalizeConfig, SurfelConfig
@@ -309,6 +310,81 @@ def test_neither_motion_nor_picture_is_no_pose() -> None:
     assert track([]) == []
     blind = [replace(step, view=None) for step in steps[:3]]
     assert [one.source for one in track(blind)] == ["start", "inertial", "inertial"]
+
+
+def squared_surprise(found: list[PoseEstimate], drive: list[SE2]) -> list[float]:
+    """Of each pose but the first, the squared Mahalanobis distance of the truth, over its three degrees of freedom."""
+    surprises = []
+    for estimate, true in list(zip(found, drive, strict=True))[1:]:
+        assert estimate.map_from_robot is not None
+        assert estimate.covariance is not None
+        wanted, pose = drive[0].between(true), estimate.map_from_robot
+        turn = math.remainder(pose.heading_rad - wanted.heading_rad, math.tau)
+        error = np.array([pose.x_m - wanted.x_m, pose.y_m - wanted.y_m, turn])
+        surprises.append(float(error @ np.linalg.solve(np.array(estimate.covariance).reshape(3, 3), error)) / 3)
+    return surprises
+
+
+def test_covariances_are_of_the_size_of_the_errors() -> None:
+    """Neither boasting nor hiding: 1 would be perfect. The first pose is exact, since it makes the map frame."""
+    surprises = []
+    for seed in (0, 1, 2):
+        drive = make_drive(16)
+        found = track(make_views(make_room(seed), drive, bias=BIAS, noise_m=0.03, noise_rad=0.02))
+        assert found[0].covariance is not None
+        assert max(found[0].covariance) < 1e-7
+        assert {verdict_of(one, 0.1, 0.035) for one in found} == {OK}
+        surprises += squared_surprise(found, drive)
+    assert 0.1 < float(np.mean(surprises)) < 2.5
+
+
+def test_doubt_grows_where_motion_alone_leads() -> None:
+    """Keyframes without a picture are told with a covariance that grows, until the walls are seen again."""
+    drive = make_drive(14)
+    steps = make_views(make_room(), drive, bias=BIAS, noise_m=0.03, noise_rad=0.02)
+    for index in (7, 8):
+        steps[index] = replace(steps[index], view=None)
+    found = track(steps)
+    spread = [math.sqrt(one.covariance[0] + one.covariance[4]) if one.covariance else math.nan for one in found]
+    assert 2 * spread[6] < spread[7] < spread[8]
+    assert spread[9] < 0.3 * spread[8]
+    assert max(squared_surprise(found, drive)[6:8]) < 6
+    assert [verdict_of(found[index], 0.1, 0.035) for index in (6, 7, 8, 9)] == [OK, UNCERTAIN, UNCERTAIN, OK]
+
+
+def carried(room: Room, other: Room, *, motion: SE2 | None) -> tuple[list[Step], list[SE2]]:
+    """A robot that drives, is carried off, and drives on; its odometry tells something of that, or nothing."""
+    drive = make_drive(12)
+    away = [SE2(1.2, -0.8, 2.4) @ pose for pose in make_drive(14)]
+    first, second = observed(make_views(room, drive)), observed(make_views(other, away))
+    later = [replace(step, frame=12 + step.frame, stamp_nanos=step.stamp_nanos + 60 * SECOND) for step in second]
+    return [*first, replace(later[0], motion=motion), *later[1:]], [*drive, *away]
+
+
+@pytest.mark.parametrize("motion", [None, SE2(0.0, 0.0, 0.0)], ids=["without motion", "wheels at rest"])
+def test_a_robot_that_was_carried_is_found_by_its_map(motion: SE2 | None) -> None:
+    """Whatever the odometry says of it."""
+    steps, drive = carried(make_room(), make_room(), motion=motion)
+    found = track(steps)
+    right = [one for one, true in zip(found, drive, strict=True) if one.map_from_robot and _near(one, true)]
+    assert len(right) >= 24
+    for one, true in zip(found, drive, strict=True):
+        assert verdict_of(one, 0.1, 0.035) != OK or _near(one, true)
+
+
+def _near(estimate: PoseEstimate, true: SE2) -> bool:
+    assert estimate.map_from_robot is not None
+    apart = true.between(estimate.map_from_robot)
+    return math.hypot(apart.x_m, apart.y_m) < 0.05 and abs(apart.heading_rad) < 0.02
+
+
+@pytest.mark.parametrize("motion", [None, SE2(0.0, 0.0, 0.0)], ids=["without motion", "wheels at rest"])
+def test_a_robot_that_was_carried_to_another_room_is_not_found_in_the_first(motion: SE2 | None) -> None:
+    """Its poses are called uncertain, or there are none."""
+    steps, drive = carried(make_room(), make_room(5), motion=motion)
+    found = track(steps)
+    assert all(_near(one, true) for one, true in zip(found[:12], drive[:12], strict=True))
+    assert {verdict_of(one, 0.1, 0.035) for one in found[12:]}.isdisjoint({OK})
 
 
 def test_parts_hold_everything() -> None:
