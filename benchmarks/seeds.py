@@ -19,6 +19,8 @@ from machine import machine
 from semslam.sim.dataset import Recipe
 from semslam.sim.simulate import simulate
 
+ESTIMATORS = ("surfel", "paper", "paper_visual", "dead_reckoning")
+
 
 def main() -> None:
     """Record, run, evaluate."""
@@ -34,6 +36,7 @@ def main() -> None:
         simulate(folder / "homes", recipe)
         command = [sys.executable, "-m", "semslam.pipeline.cli"]
         run = [*command, "run", str(folder / "homes" / "logs"), "--out", str(folder / "out"), "--quiet"]
+        run += [part for name in ESTIMATORS for part in ("--estimator", name)]
         subprocess.run(run, check=True)
         done = subprocess.run([*command, "evaluate", str(folder / "out")], check=True, capture_output=True, text=True)
         print(done.stdout)
