@@ -38,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="output folder of `semslam demo` or `semslam run`")
     parser.add_argument("--frame", type=int, default=0)
-    parser.add_argument("--estimator", default="paper")
+    parser.add_argument("--estimator", default="surfel")
     parser.add_argument("--out", type=Path, default=Path("docs/demo.png"))
     args = parser.parse_args()
     folder = OutputFolder(args.run)
