@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,16 @@ import pytest
 from evo.tools import file_interface
 
 from semslam.errors import SemslamError
+from semslam.geometry import rle
+from semslam.geometry.frames import FLU_FROM_OPTICAL
 from semslam.labels import FREE_FLOOR, OBSTACLE, class_list
 from semslam.slam import exchange
 from semslam.stages import export
 from semslam.stages.contract import FinishedShard
 from semslam.stages.settings import ExportConfig
 from semslam.tables.parquet import TableFiles, write_table
-from semslam.tables.spec import CELLS, POSES, TRAJECTORY
+from semslam.tables.pictures import encode_colour, encode_depth
+from semslam.tables.spec import CELLS, DETECTIONS, FRAMES, OBJECTS, POSES, TRAJECTORY
 from tests.slam_world import MemoryContext
 
 CLASSES = class_list(("chair",))
@@ -54,16 +58,47 @@ def write_cells(path: Path, cells: dict[tuple[int, int], int]) -> None:
     write_table(path, CELLS, rows, META)
 
 
+def write_sights(folder: Path, count: int, seen: Sequence[int]) -> None:
+    """A board two metres ahead, half a metre wide, in all frames; a chair in those that see it as one."""
+    depth_m = np.full((120, 160), 5.0, np.float32)
+    depth_m[40:80, 60:100] = 2.0
+    board = rle.encode(depth_m == 2.0)
+    robot_from_camera = FLU_FROM_OPTICAL.copy()
+    robot_from_camera[2, 3] = 0.5
+    same: dict[str, Any] = {
+        "log_time_nanos": 0, "depth_offset_nanos": 0, "width": 160, "height": 120, "fx": 160.0, "fy": 160.0, "cx": 79.5,
+        "cy": 59.5, "roll_rad": 0.0, "pitch_rad": 0.0, "level_source": "tf", "camera_height_m": 0.5,
+        "height_source": "tf", "robot_from_camera": robot_from_camera.ravel().tolist(),
+        "colour": encode_colour(np.zeros((120, 160, 3), np.uint8)), "depth": encode_depth(depth_m),
+    }  # fmt: skip
+    frames = range(count)
+    rows = {name: [value] * count for name, value in same.items()}
+    stamps = [STAMP + frame * 10**9 for frame in frames]
+    write_table(folder / "frames.parquet", FRAMES, {**rows, "frame": list(frames), "stamp_nanos": stamps})
+    found: dict[str, Any] = {
+        "detection": 0, "class_id": 3, "label": "chair", "source_label": "chair", "score": 0.5, "x0_px": 60.0,
+        "y0_px": 40.0, "x1_px": 100.0, "y1_px": 80.0, "mask_runs": board, "mask_pixels": 1600, "depth_pixels": 1600,
+        "min_x_m": 2.0, "min_y_m": -0.25, "min_z_m": 0.25, "max_x_m": 2.0, "max_y_m": 0.25, "max_z_m": 0.75,
+    }  # fmt: skip
+    rows = {name: [value] * len(seen) for name, value in found.items()}
+    stamps = [STAMP + frame * 10**9 for frame in seen]
+    meta = {"classes": list(CLASSES)}
+    write_table(folder / "detections.parquet", DETECTIONS, {**rows, "frame": list(seen), "stamp_nanos": stamps}, meta)
+
+
 def exported(
     folder: Path,
     poses: list[tuple[float, float, float] | None],
     cells: dict[tuple[int, int], int],
     config: ExportConfig = ROS,
+    seen: Sequence[int] = (),
 ) -> MemoryContext:
     folder.mkdir(parents=True, exist_ok=True)
     write_poses(folder / "poses.parquet", poses)
     write_cells(folder / "cells.parquet", cells)
-    inputs = {table.name: TableFiles(table, [folder / f"{table.name}.parquet"]) for table in (POSES, CELLS)}
+    write_sights(folder, len(poses), seen)
+    tables = (POSES, CELLS, FRAMES, DETECTIONS)
+    inputs = {table.name: TableFiles(table, [folder / f"{table.name}.parquet"]) for table in tables}
     context = MemoryContext(folder / "out", inputs, config, "paper")
     export.run(context)
     return context
@@ -77,9 +112,9 @@ def test_all_files_are_there(tmp_path: Path) -> None:
     """Exactly these."""
     context = exported(tmp_path, POSE_LIST, CELL_LIST)
     assert sorted(path.name for path in (context.folder / "shard-0").iterdir()) == [
-        "map.parquet", "map.pgm", "map.png", "map.yaml", "trajectory.parquet", "trajectory.tum",
+        "map.parquet", "map.pgm", "map.png", "map.yaml", "objects.parquet", "trajectory.parquet", "trajectory.tum",
     ]  # fmt: skip
-    assert context.done[-1] == (5, 5)
+    assert context.done[-1] == (6, 6)
     assert context.shards[0].warnings == []
 
 
@@ -173,3 +208,20 @@ def test_a_finished_export_is_not_repeated(tmp_path: Path) -> None:
     context.finished = (FinishedShard(0, {}, {}, context.folder / "shard-0"),)
     export.run(context)
     assert len(context.shards) == 1
+
+
+def test_objects_stand_where_detections_lie_at_the_poses(tmp_path: Path) -> None:
+    """Seen from keyframes with a pose alone; one that too few saw is left out."""
+    poses = [(1.0, 2.0, math.pi / 2), None, (1.0, 2.0, math.pi / 2)]
+    context = exported(tmp_path / "seen", poses, CELL_LIST, seen=[0, 1, 2])
+    rows = context.results(OBJECTS)["objects"].read()
+    assert (rows["label"], rows["frames"]) == (["chair"], [[0, 2]])
+    assert rows["x_m"][0] == pytest.approx(1.0, abs=0.05)
+    assert rows["y_m"][0] == pytest.approx(4.0, abs=0.05)
+    assert rows["height_m"][0] == pytest.approx(0.75, abs=0.02)
+    assert (rows["first_seen_nanos"], rows["last_seen_nanos"]) == ([STAMP], [STAMP + 2 * 10**9])
+    assert context.results(OBJECTS)["objects"].meta["classes"] == list(CLASSES)
+    alone = exported(tmp_path / "alone", poses, CELL_LIST, seen=[0, 1])
+    assert alone.results(OBJECTS)["objects"].read()["label"] == []
+    config = ExportConfig(object_frames=1)
+    assert len(exported(tmp_path / "one", poses, CELL_LIST, config, [0]).results(OBJECTS)["objects"].read()["x_m"]) == 1

@@ -12,6 +12,7 @@ from semslam.tables.spec import (
     DETECTIONS,
     FRAMES,
     MOTION,
+    OBJECTS,
     OBSERVATIONS,
     PLACES,
     POSES,
@@ -54,10 +55,10 @@ LOCALIZE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=1,
+    version=2,
     config=ExportConfig,
-    reads=(POSES, CELLS, PLACES),
-    writes=(TRAJECTORY,),
+    reads=(POSES, CELLS, PLACES, FRAMES, DETECTIONS),
+    writes=(TRAJECTORY, OBJECTS),
     entry="semslam.stages.export:run",
     unit="file",
     libraries=("numpy", "opencv-contrib-python-headless", "pyarrow"),

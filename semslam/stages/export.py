@@ -3,7 +3,10 @@
 Reads   poses          data_spec.md, table 7
         cells          data_spec.md, table 9
         places         data_spec.md, table 16, of estimators that have one
+        frames         data_spec.md, table 2: depth, for the objects
+        detections     data_spec.md, table 5
 Writes  trajectory     data_spec.md, table 10: keyframes with a pose
+        objects        data_spec.md, table 17: the things of the map
 Files   map.png        the picture
         map.parquet    the cells table again, as a file that stands alone
         map.yaml, map.pgm   ROS map_server; left out, with a warning, for maps too large for a picture of single cells
@@ -13,21 +16,27 @@ Files   map.png        the picture
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 
+from semslam.geometry import rle
+from semslam.geometry.frames import SE2
+from semslam.geometry.projection import flying, main_body, points_in_robot
 from semslam.slam.exchange import MAX_PIXELS, map_yaml, occupancy_image, pgm, tum, unknown_grey
+from semslam.slam.objects import Patch, things
 from semslam.slam.picture import MapCells, Path
 from semslam.slam.render import render_map
 from semslam.stages.contract import ShardWriter, StageContext, TableSource
 from semslam.stages.settings import ExportConfig
 from semslam.tables.parquet import TableFileWriter, write_table
-from semslam.tables.spec import CELLS, PLACES, POSES, TRAJECTORY
+from semslam.tables.pictures import decode_depth
+from semslam.tables.spec import CELLS, DETECTIONS, FRAMES, OBJECTS, PLACES, POSES, TRAJECTORY
 
 _POSE = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad", "verdict")
-_FILES = 5
+_FILES = 6
 
 Columns = Mapping[str, list[Any]]
 
@@ -51,6 +60,8 @@ def run(ctx: StageContext) -> None:
         subtitle = _subtitle(str(cells.meta["estimator"]), path, shown)
         shard.path("map.png").write_bytes(render_map(shown, path, ctx.log, subtitle, config.pixels_per_cell))
         _write_places(ctx, shard)
+        ctx.progress(5, _FILES)
+        _write_objects(ctx, shard, track, dict(cells.meta), config.object_frames)
         ctx.progress(_FILES, _FILES)
 
 
@@ -68,6 +79,68 @@ def _write_places(ctx: StageContext, shard: ShardWriter) -> None:
             file.append(rows)
     finally:
         file.close()
+
+
+def _write_objects(
+    ctx: StageContext, shard: ShardWriter, track: Columns, meta: Mapping[str, Any], least_frames: int
+) -> None:
+    """The objects that the detections show at the poses."""
+    poses = {
+        frame: SE2(x, y, heading)
+        for frame, x, y, heading in zip(*(track[name] for name in ("frame", "x_m", "y_m", "heading_rad")), strict=True)
+        if x is not None
+    }
+    found = things(_patches(ctx.read(FRAMES), ctx.read(DETECTIONS), poses), least_frames)
+    classes = meta["classes"]
+    middles = [thing.middle.tolist() for thing in found]
+    rows = {
+        "object": list(range(len(found))),
+        "class_id": [thing.class_id for thing in found],
+        "label": [classes[thing.class_id] for thing in found],
+        "x_m": [x for x, _ in middles],
+        "y_m": [y for _, y in middles],
+        "area_m2": [thing.area_m2 for thing in found],
+        "height_m": [thing.height_m for thing in found],
+        "footprint": [thing.footprint.ravel().tolist() for thing in found],
+        "score": [thing.score for thing in found],
+        "frames": [list(thing.frames) for thing in found],
+        "first_seen_nanos": [thing.first_seen_nanos for thing in found],
+        "last_seen_nanos": [thing.last_seen_nanos for thing in found],
+    }
+    shard.table(OBJECTS, meta).append(rows)
+    shard.count("objects", len(found))
+
+
+def _patches(frames: TableSource, detections: TableSource, poses: Mapping[int, SE2]) -> Iterator[Patch]:
+    """What each detection of keyframes with a pose covers of the ground."""
+    pictures = _rows(frames, ["frame", "depth", "fx", "fy", "cx", "cy", "robot_from_camera"])
+    columns = ["frame", "stamp_nanos", "class_id", "score", "mask_runs", "depth_pixels"]
+    for frame, group in groupby(_rows(detections, columns), key=lambda row: row["frame"]):
+        picture = next(row for row in pictures if row["frame"] == frame)
+        if frame in poses:
+            yield from _patches_of(picture, list(group), poses[frame])
+
+
+def _patches_of(picture: Mapping[str, Any], found: Sequence[Mapping[str, Any]], pose: SE2) -> Iterator[Patch]:
+    depth_m = decode_depth(picture["depth"])
+    fx, fy, cx, cy = (picture[name] for name in ("fx", "fy", "cx", "cy"))
+    robot_from_camera = np.array(picture["robot_from_camera"], np.float64).reshape(4, 4)
+    points = points_in_robot(depth_m, fx, fy, cx, cy, robot_from_camera)
+    usable = (depth_m > 0) & ~flying(points, depth_m > 0)
+    for row in found:
+        if not row["depth_pixels"]:
+            continue
+        inside = rle.decode(row["mask_runs"], *depth_m.shape) & usable
+        inside[inside] = main_body(np.hypot(points[..., 0][inside], points[..., 1][inside]))
+        patch = Patch.of(points[inside], pose, row["class_id"], float(row["score"]), row["frame"], row["stamp_nanos"])
+        if patch is not None:
+            yield patch
+
+
+def _rows(table: TableSource, columns: list[str]) -> Iterator[dict[str, Any]]:
+    for batch in table.batches(columns, batch_rows=8):
+        for values in zip(*batch.values(), strict=True):
+            yield dict(zip(batch, values, strict=True))
 
 
 def _map_cells(rows: Columns, meta: Mapping[str, Any]) -> MapCells:

@@ -280,3 +280,5 @@ class ExportConfig:
     """occupied_thresh of the map_server file."""
     free_threshold: float = setting(0.196, low=0.0, high=1.0)
     """free_thresh of the map_server file; 0.196 is what it reads for the grey of unknown cells."""
+    object_frames: int = setting(2, low=1, high=100000)
+    """Keyframes that must have seen an object of the objects table."""

@@ -426,7 +426,27 @@ PLACES = Table(
     ),
 )
 
+OBJECTS = Table(
+    "objects",
+    17,
+    "export",
+    (
+        _c("object", "int32", "", "index, from 0, by falling evidence"),
+        _c("class_id", "uint16", "", "index into the class list"),
+        _c("label", "string", "", "its name"),
+        _c("x_m", "float64", "m", "centroid of the footprint in the map frame"),
+        _c("y_m", "float64", "m", "likewise"),
+        _c("area_m2", "float64", "m2", "area of the footprint"),
+        _c("height_m", "float64", "m", "top above the floor"),
+        _c("footprint", "list<float64>", "m", "outline in the map frame, convex, counter-clockwise: x, y, x, y, ..."),
+        _c("score", "float32", "", "mean confidence of its detections, 0 to 1"),
+        _c("frames", "list<int64>", "", "keyframes that saw it, rising"),
+        _c("first_seen_nanos", "int64", "ns", "stamp of the first of them"),
+        _c("last_seen_nanos", "int64", "ns", "stamp of the last of them"),
+    ),
+)
+
 ALL_TABLES: tuple[Table, ...] = (
     TOPICS, FRAMES, MOTION, TRUTH, DETECTIONS, OBSERVATIONS, POSES, SNAPSHOTS, CELLS, TRAJECTORY, EVALUATION,
-    SPLITS, TRUE_MAP, HOME_OBJECTS, VIEWS, PLACES,
+    SPLITS, TRUE_MAP, HOME_OBJECTS, VIEWS, PLACES, OBJECTS,
 )  # fmt: skip
