@@ -107,7 +107,7 @@ def keyframes(frames: list[Path], motion: list[Path]) -> Iterator[Keyframe]:
             )
 
 
-def _small_gicp(frames: Iterator[Keyframe], folder: Path) -> Poses:
+def small_gicp(frames: Iterator[Keyframe], folder: Path) -> Poses:
     """Motion, then GICP of the cloud against the points of all earlier ones; the robot stays on its floor."""
     del folder
     gicp = importlib.import_module("small_gicp")
@@ -185,7 +185,7 @@ def _orb_vocabulary(slam: Any) -> str:
 
 
 _PEERS: dict[str, Callable[[Iterator[Keyframe], Path], Poses]] = {
-    "small_gicp": _small_gicp,
+    "small_gicp": small_gicp,
     "kiss_icp": _kiss_icp,
     "pyorbslam3": _pyorbslam3,
 }
