@@ -449,6 +449,10 @@ def test_a_log_is_found_in_a_map_made_before(known: Path) -> None:
         assert math.hypot(apart.x_m, apart.y_m) < 0.03
         assert abs(apart.heading_rad) < 0.01
         assert estimate.modes[0].probability > 0.9
+        assert estimate.peak == estimate.modes[0].probability
+        assert estimate.entropy_nats is not None
+        assert estimate.entropy_nats < 0.4
+        assert verdict_of(estimate, 0.1, 0.035) == OK
         mode = estimate.map_from_robot.between(estimate.modes[0].map_from_robot)
         assert max(abs(mode.x_m), abs(mode.y_m), abs(mode.heading_rad)) < 1e-9
 
@@ -467,6 +471,7 @@ def test_a_room_that_looks_the_same_from_both_ends_is_ambiguous(tmp_path: Path) 
     for true in (second[0], half_turn @ second[0]):
         apart = [true.between(way) for way in ways]
         assert min(math.hypot(one.x_m, one.y_m) for one in apart) < 0.05
+    assert found[0].entropy_nats == pytest.approx(math.log(2), abs=0.1)
 
 
 def test_another_room_is_not_found(known: Path) -> None:

@@ -53,7 +53,7 @@ def open_whole(
         from semslam.slam.surfel.estimator import SurfelEstimator
         from semslam.slam.surfel.prior import Grid
 
-        return SurfelEstimator(config.surfel, Grid(classes, cell_m, side))
+        return SurfelEstimator(config.surfel, Grid(classes, cell_m, side), config.modes)
     raise SemslamError(f"There is no estimator of whole logs `{name}`", hint=f"choose from {', '.join(WHOLE_LOGS)}")
 
 

@@ -6,6 +6,7 @@ Nothing is told of a keyframe before the last one was taken, since the last one 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -28,9 +29,6 @@ from semslam.slam.surfel.surfels import Surfels
 from semslam.slam.surfel.tracking import SHORTEST_S, Keyframe, Place, Track, moved, placed
 from semslam.stages.settings import SurfelConfig
 
-_MODES = 3
-"""Ways to lie on a map made before that are told, at most."""
-
 _Arrays = dict[str, NDArray[Any]]
 Floats = NDArray[np.float64]
 
@@ -38,14 +36,15 @@ Floats = NDArray[np.float64]
 class SurfelEstimator:
     """A pose track from depth, with motion where depth says nothing."""
 
-    def __init__(self, config: SurfelConfig, grid: Grid) -> None:
-        """`grid` of the observations.
+    def __init__(self, config: SurfelConfig, grid: Grid, modes: int = 5) -> None:
+        """`grid` of the observations; `modes`: ways to lie on a map made before that are told, at most.
 
         Raises:
             SemslamError: the map made before cannot be read, or was made of other observations.
         """
         self._config = config
         self._grid = grid
+        self._modes = modes
         self._prior = read_prior(Path(config.prior), grid) if config.prior else None
         self._track = Track(config)
         self._frames: list[int] = []
@@ -111,21 +110,25 @@ class SurfelEstimator:
 
     def _laid(self, placement: Placement) -> list[PoseEstimate]:
         """The poses in the map made before. None if that is not sure; if there are several ways, they are the modes."""
-        ways = [(way.other_from_own, way.probability) for way in placement.proposals[:_MODES]]
+        ways = [(way.other_from_own, way.probability) for way in placement.proposals[: self._modes]]
+        told: dict[str, Any] = {}
+        if ways:
+            shares = [way.probability for way in placement.proposals if way.probability > 0]
+            told = {"peak": ways[0][1], "entropy_nats": sum(-share * math.log(share) for share in shares)}
         modes = [
             tuple(Mode(way @ planar(place.pose), probability) for way, probability in ways) for place in self._places
         ]
         found = placement.other_from_own
         if found is None:
-            told = modes if placement.verdict == AMBIGUOUS else [()] * len(modes)
-            return [PoseEstimate(None, NONE, modes=some) for some in told]
+            known = modes if placement.verdict == AMBIGUOUS else [()] * len(modes)
+            return [PoseEstimate(None, NONE, modes=some, **told) for some in known]
         error = placement.proposals[0].covariance
         self._covariances = [
             _carried(found, error, planar(place.pose), own)
             for place, own in zip(self._places, self._covariances, strict=False)
         ]
         self._places = [moved(place, found.matrix @ place.pose) for place in self._places]
-        return [replace(one, modes=some) for one, some in zip(self._told(), modes, strict=True)]
+        return [replace(one, modes=some, **told) for one, some in zip(self._told(), modes, strict=True)]
 
     def warnings(self) -> Iterator[str]:
         """What a user should know of the track, once it is finished."""
@@ -139,7 +142,7 @@ class SurfelEstimator:
         if placement is None or placement.other_from_own is not None:
             return
         if placement.verdict == AMBIGUOUS:
-            chances = ", ".join(f"{way.probability:.0%}" for way in placement.proposals[:_MODES])
+            chances = ", ".join(f"{way.probability:.0%}" for way in placement.proposals[: self._modes])
             yield (
                 f"ambiguous: the log fits the map of `localize.surfel.prior` in several ways alike ({chances}); "
                 "it has no poses, and the poses table holds the ways as modes"
