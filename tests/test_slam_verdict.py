@@ -26,6 +26,7 @@ def test_without_a_pose_it_is_lost_and_without_a_covariance_uncertain() -> None:
     """Nobody vouches for either."""
     assert verdict_of(PoseEstimate(None, NONE), 100.0, 3.0) == LOST
     assert verdict_of(PoseEstimate(HERE, INERTIAL), 100.0, 3.0) == UNCERTAIN
+    assert verdict_of(PoseEstimate(HERE, INERTIAL, covariance=(math.nan,) * 9), 100.0, 3.0) == UNCERTAIN
 
 
 @pytest.mark.parametrize("turned_rad", [0.0, 0.7, 2.0])

@@ -172,7 +172,7 @@ class Planner:
             "version": stage.version,
             "variant": task.variant,
             "config": self._settings_of(task),
-            "spec": max(table.version for table in (*stage.reads, *stage.writes)),
+            "spec": _versions(stage),
             "libraries": {name: library_version(name) for name in stage.libraries},
         }
         if any(path.lower().endswith(".onnx") for _, path in file_settings(self.task_config(task), stage.name)):
@@ -294,7 +294,7 @@ def changes(stage: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[
     if old.get("version") != new["version"]:
         found.append(f"stage version {old.get('version')} -> {new['version']}")
     if old.get("spec") != new["spec"]:
-        found.append(f"table specification {old.get('spec')} -> {new['spec']}")
+        found.append(f"table versions {old.get('spec')} -> {new['spec']}")
     found += _library_changes(old.get("libraries", {}), new.get("libraries", {}))
     if old.get("provider") != new.get("provider"):
         found.append(f"provider {_shown(old.get('provider'))} -> {_shown(new.get('provider'))}")
@@ -325,3 +325,9 @@ def _shown(value: Any) -> str:
     if isinstance(value, str):
         return f"content {value[7:15]}" if value.startswith("sha256:") else value or '""'
     return canonical_json(value)
+
+
+def _versions(stage: Stage) -> int | dict[str, int]:
+    """Versions of the tables that a stage reads and writes; 1 if all are first ones."""
+    versions = {table.name: table.version for table in (*stage.reads, *stage.writes)}
+    return 1 if set(versions.values()) <= {1} else versions

@@ -9,6 +9,7 @@ a mask that spilled over once does not widen it.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -99,13 +100,24 @@ class _Track:
     patches: list[Patch] = field(default_factory=list)
     counts: dict[int, int] = field(default_factory=dict)
     """Keyframes that saw a cell."""
+    last: dict[int, int] = field(default_factory=dict)
+    """The last of them."""
 
-    def take(self, patches: Sequence[Patch]) -> None:
-        """More of the same thing."""
-        for patch in patches:
-            self.patches.append(patch)
-            for cell in patch.cells.tolist():
-                self.counts[cell] = self.counts.get(cell, 0) + 1
+    @staticmethod
+    def of(patches: Iterable[Patch]) -> _Track:
+        """Patches of one thing, in any order."""
+        rising = sorted(patches, key=lambda patch: patch.frame)
+        track = _Track(rising[0].class_id)
+        for patch in rising:
+            track.take(patch)
+        return track
+
+    def take(self, patch: Patch) -> None:
+        """More of the same thing, of the same keyframe or a later one."""
+        self.patches.append(patch)
+        for cell in patch.cells.tolist():
+            self.counts[cell] = self.counts.get(cell, 0) + (self.last.get(cell) != patch.frame)
+            self.last[cell] = patch.frame
 
     @property
     def evidence(self) -> float:
@@ -123,53 +135,78 @@ class _Track:
         return tuple(sorted({patch.frame for patch in self.patches}))
 
 
+class _Ground:
+    """Which tracks lie on a cell."""
+
+    def __init__(self) -> None:
+        self.sizes: list[int] = []
+        """Cells of each track."""
+        self._on: dict[int, list[int]] = {}
+
+    def lay(self, number: int, cells: Iterable[int]) -> None:
+        """Add cells that the track did not have; a new one has the next number."""
+        if number == len(self.sizes):
+            self.sizes.append(0)
+        for cell in cells:
+            self._on.setdefault(cell, []).append(number)
+            self.sizes[number] += 1
+
+    def met(self, cells: Iterable[int]) -> Counter[int]:
+        """How many of the cells each track has."""
+        return Counter(number for cell in cells for number in self._on.get(cell, ()))
+
+
 def things(patches: Iterable[Patch], least_frames: int) -> list[Thing]:
     """The objects that patches, by rising keyframe, show, each in so many keyframes at least; most evidence first."""
     tracks: list[_Track] = []
+    grounds: dict[int, tuple[_Ground, list[_Track]]] = {}
     for patch in patches:
-        cells = set(patch.cells.tolist())
-        shares = [(_met(cells, set(track.counts)), number) for number, track in enumerate(tracks)]
-        same = [(share, -number) for share, number in shares if tracks[number].class_id == patch.class_id]
-        share, number = max(same, default=(0.0, 0))
-        if share < _SAME:
-            tracks.append(_Track(patch.class_id))
-        (tracks[-number] if share >= _SAME else tracks[-1]).take([patch])
-    tracks = _joined(tracks)
-    seen = [track for track in tracks if len(track.frames) >= least_frames]
+        ground, own = grounds.setdefault(patch.class_id, (_Ground(), []))
+        cells = patch.cells.tolist()
+        number = _same(ground, cells)
+        if number == len(own):
+            own.append(_Track(patch.class_id))
+            tracks.append(own[number])
+        ground.lay(number, [cell for cell in cells if cell not in own[number].counts])
+        own[number].take(patch)
+    seen = [track for track in _joined(tracks) if len(track.frames) >= least_frames]
     return [_thing(track) for track in _unrivalled(seen)]
+
+
+def _same(ground: _Ground, cells: Sequence[int]) -> int:
+    """The track that cells are of: the one that they meet most; a new one if they meet none enough."""
+    shares = [(count / min(len(cells), ground.sizes[number]), -number) for number, count in ground.met(cells).items()]
+    share, number = max(shares, default=(0.0, 0))
+    return -number if share >= _SAME else len(ground.sizes)
 
 
 def _joined(tracks: Sequence[_Track]) -> list[_Track]:
     """Tracks that turned out to be of one thing once more of it was seen."""
-    kept: list[_Track] = []
-    for track in sorted(tracks, key=lambda one: -one.evidence):
-        cells = track.cells
-        same = [one for one in kept if one.class_id == track.class_id and _met(cells, one.cells) >= _SAME]
-        if same:
-            same[0].take(track.patches)
-        else:
-            kept.append(track)
-    return kept
+    grounds: dict[int, tuple[_Ground, list[list[Patch]], list[set[int]]]] = {}
+    for track in sorted(tracks, key=lambda one: (-one.evidence, one.frames)):
+        ground, groups, known = grounds.setdefault(track.class_id, (_Ground(), [], []))
+        cells = sorted(track.cells)
+        number = _same(ground, cells)
+        if number == len(groups):
+            groups.append([])
+            known.append(set())
+        groups[number] += track.patches
+        ground.lay(number, [cell for cell in cells if cell not in known[number]])
+        known[number].update(cells)
+    return [_Track.of(group) for _, groups, _ in grounds.values() for group in groups]
 
 
 def _unrivalled(tracks: Sequence[_Track]) -> list[_Track]:
     """Without things that stand where one of another class, with more evidence, stands."""
     kept: list[_Track] = []
+    ground = _Ground()
     for track in sorted(tracks, key=lambda one: (-one.evidence, one.frames)):
-        cells = track.cells
-        if all(_alike(cells, other.cells) < _CLAIMED for other in kept):
+        cells = sorted(track.cells)
+        met = ground.met(cells).items()
+        if all(count < _CLAIMED * (len(cells) + ground.sizes[number] - count) for number, count in met):
+            ground.lay(len(kept), cells)
             kept.append(track)
     return kept
-
-
-def _met(one: set[int], other: set[int]) -> float:
-    """Share of the smaller set's cells that lie in the other."""
-    return len(one & other) / max(1, min(len(one), len(other)))
-
-
-def _alike(one: set[int], other: set[int]) -> float:
-    """Intersection over union."""
-    return len(one & other) / max(1, len(one | other))
 
 
 def _thing(track: _Track) -> Thing:

@@ -24,6 +24,8 @@ def verdict_of(estimate: PoseEstimate, ok_m: float, ok_rad: float) -> str:
     if estimate.covariance is None:
         return UNCERTAIN
     covariance = np.array(estimate.covariance).reshape(3, 3)
+    if not np.isfinite(covariance).all():
+        return UNCERTAIN
     place = math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance[:2, :2])[-1])))
     heading = math.sqrt(max(0.0, float(covariance[2, 2])))
     return OK if _PLACE_SIGMAS * place <= ok_m and _HEADING_SIGMAS * heading <= ok_rad else UNCERTAIN

@@ -44,7 +44,7 @@ EXTRACT = Stage(
 )
 LOCALIZE = Stage(
     "localize",
-    version=2,
+    version=3,
     config=LocalizeConfig,
     reads=(FRAMES, MOTION, OBSERVATIONS),
     writes=(POSES, SNAPSHOTS, CELLS, PLACES),

@@ -25,6 +25,7 @@ import numpy as np
 from semslam.geometry import rle
 from semslam.geometry.frames import SE2
 from semslam.geometry.projection import flying, main_body, points_in_robot
+from semslam.slam.evidence import LARGEST_M
 from semslam.slam.exchange import MAX_PIXELS, map_yaml, occupancy_image, pgm, tum, unknown_grey
 from semslam.slam.objects import Patch, things
 from semslam.slam.picture import MapCells, Path
@@ -61,7 +62,7 @@ def run(ctx: StageContext) -> None:
         shard.path("map.png").write_bytes(render_map(shown, path, ctx.log, subtitle, config.pixels_per_cell))
         _write_places(ctx, shard)
         ctx.progress(5, _FILES)
-        _write_objects(ctx, shard, track, dict(cells.meta), config.object_frames)
+        _write_objects(ctx, shard, track, dict(cells.meta), config)
         ctx.progress(_FILES, _FILES)
 
 
@@ -82,15 +83,16 @@ def _write_places(ctx: StageContext, shard: ShardWriter) -> None:
 
 
 def _write_objects(
-    ctx: StageContext, shard: ShardWriter, track: Columns, meta: Mapping[str, Any], least_frames: int
+    ctx: StageContext, shard: ShardWriter, track: Columns, meta: Mapping[str, Any], config: ExportConfig
 ) -> None:
     """The objects that the detections show at the poses."""
     poses = {
         frame: SE2(x, y, heading)
         for frame, x, y, heading in zip(*(track[name] for name in ("frame", "x_m", "y_m", "heading_rad")), strict=True)
-        if x is not None
+        if x is not None and max(abs(x), abs(y)) < LARGEST_M
     }
-    found = things(_patches(ctx.read(FRAMES), ctx.read(DETECTIONS), poses), least_frames)
+    patches = _patches(ctx.read(FRAMES), ctx.read(DETECTIONS), poses, config.object_depth_m)
+    found = things(patches, config.object_frames)
     classes = meta["classes"]
     middles = [thing.middle.tolist() for thing in found]
     rows = {
@@ -111,22 +113,27 @@ def _write_objects(
     shard.count("objects", len(found))
 
 
-def _patches(frames: TableSource, detections: TableSource, poses: Mapping[int, SE2]) -> Iterator[Patch]:
+def _patches(
+    frames: TableSource, detections: TableSource, poses: Mapping[int, SE2], max_depth_m: float
+) -> Iterator[Patch]:
     """What each detection of keyframes with a pose covers of the ground."""
     pictures = _rows(frames, ["frame", "depth", "fx", "fy", "cx", "cy", "robot_from_camera"])
     columns = ["frame", "stamp_nanos", "class_id", "score", "mask_runs", "depth_pixels"]
     for frame, group in groupby(_rows(detections, columns), key=lambda row: row["frame"]):
-        picture = next(row for row in pictures if row["frame"] == frame)
-        if frame in poses:
-            yield from _patches_of(picture, list(group), poses[frame])
+        picture = next((row for row in pictures if row["frame"] == frame), None)
+        if picture is not None and frame in poses:
+            yield from _patches_of(picture, list(group), poses[frame], max_depth_m)
 
 
-def _patches_of(picture: Mapping[str, Any], found: Sequence[Mapping[str, Any]], pose: SE2) -> Iterator[Patch]:
+def _patches_of(
+    picture: Mapping[str, Any], found: Sequence[Mapping[str, Any]], pose: SE2, max_depth_m: float
+) -> Iterator[Patch]:
     depth_m = decode_depth(picture["depth"])
     fx, fy, cx, cy = (picture[name] for name in ("fx", "fy", "cx", "cy"))
     robot_from_camera = np.array(picture["robot_from_camera"], np.float64).reshape(4, 4)
     points = points_in_robot(depth_m, fx, fy, cx, cy, robot_from_camera)
-    usable = (depth_m > 0) & ~flying(points, depth_m > 0)
+    near = (depth_m > 0) & (depth_m <= max_depth_m)
+    usable = near & ~flying(points, near)
     for row in found:
         if not row["depth_pixels"]:
             continue

@@ -214,7 +214,8 @@ class SurfelConfig:
     prior: str = setting("", file=True)
     """places.parquet of a map made before, in which logs are to be found without a first guess; empty for none."""
     rounds: int = setting(10, low=0, high=100)
-    """Times, at most, that all keyframes are aligned with each other at the end; 0 keeps the track as it was walked."""
+    """Times, at most, that all keyframes are aligned with each other at the end; 0 keeps the track as it was walked,
+    without covariances, and what was not found while walking is found no more."""
 
 
 _PAPER = ("paper", "paper_visual")
@@ -282,3 +283,5 @@ class ExportConfig:
     """free_thresh of the map_server file; 0.196 is what it reads for the grey of unknown cells."""
     object_frames: int = setting(2, low=1, high=100000)
     """Keyframes that must have seen an object of the objects table."""
+    object_depth_m: float = setting(6.0, low=0.5, high=1000.0)
+    """Farther points belong to no object of that table, metres."""

@@ -43,7 +43,7 @@ _ROW_GROUP_BYTES = 8 << 20
 
 
 class TableError(SemslamError):
-    """A table file is missing, damaged, or of another specification."""
+    """A table file is missing, damaged, or of another version."""
 
 
 @contextmanager
@@ -128,7 +128,7 @@ class TableFiles:
     """One table lying in the files of its shards, read as a whole, in order.
 
     Raises:
-        TableError: a file is missing, damaged, of another table or of another specification version.
+        TableError: a file is missing, damaged, of another table or of another version of it.
     """
 
     def __init__(self, table: Table, paths: Sequence[Path]) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from semslam.geometry.frames import SE2, planar
 from semslam.slam.checkpoint import as_array, pack, unpack
 from semslam.slam.estimator import INERTIAL, NONE, START, VISUAL, Mode, PoseEstimate, Step
-from semslam.slam.surfel.motion_prior import MotionPrior
+from semslam.slam.surfel.motion_prior import MotionPrior, noise_sigmas
 from semslam.slam.surfel.prior import Grid, Seen, place_row, read_prior, submap_of
 from semslam.slam.surfel.registration import AMBIGUOUS, Placement, place_in
 from semslam.slam.surfel.rejoining import rejoined, without_specks
@@ -85,12 +84,12 @@ class SurfelEstimator:
 
     def _smoothed(self, watch: Callable[[int], None] | None) -> Smoothed:
         """All keyframes aligned, and parts that nothing ties to the first one looked for in its map."""
-        walked = without_specks(self._track.places)
-        smoothed = smooth(walked, self._track.prior.bias, self._config, watch)
+        walked, scale = without_specks(self._track.places), self._track.prior.scale
+        smoothed = smooth(walked, self._track.prior.bias, self._config, watch, scale)
         if len(smoothed.parts) < 2:
             return smoothed
         places = rejoined(smoothed, self._seen, self._grid)
-        return smooth(places, smoothed.bias, self._config) if places else smoothed
+        return smooth(places, smoothed.bias, self._config, scale=scale) if places else smoothed
 
     def _known(self) -> Iterator[tuple[int, Place, Seen]]:
         """Number, place and observation of keyframes whose place pictures tell."""
@@ -121,7 +120,7 @@ class SurfelEstimator:
         found = placement.other_from_own
         if found is None:
             known = modes if placement.verdict == AMBIGUOUS else [()] * len(modes)
-            return [PoseEstimate(None, NONE, modes=some, **told) for some in known]
+            return [PoseEstimate(None, NONE, modes=some, **(told if some else {})) for some in known]
         error = placement.proposals[0].covariance
         self._covariances = [
             _carried(found, error, planar(place.pose), own)
@@ -163,6 +162,7 @@ class SurfelEstimator:
         self._kept = len(self._stamps)
         prior = self._track.prior
         arrays: _Arrays = {"bias": prior.bias, "covariance": prior.covariance, "speed": prior.speed}
+        arrays["surprise"] = np.array([prior.surprise, prior.steps])
         arrays["open"] = self._track.open
         arrays["group"] = np.array([self._track.group, self._track.parked])
         arrays["frames"] = np.array([self._frames[index] for index in new], np.int64)
@@ -177,6 +177,7 @@ class SurfelEstimator:
             arrays = unpack(part)
             prior = self._track.prior
             prior.bias, prior.covariance, prior.speed = arrays["bias"], arrays["covariance"], arrays["speed"]
+            prior.surprise, prior.steps = float(arrays["surprise"][0]), int(arrays["surprise"][1])
             self._track.open = arrays["open"]
             self._track.group, self._track.parked = int(arrays["group"][0]), bool(arrays["group"][1])
             for frame, stamp in zip(arrays["frames"].tolist(), arrays["stamps"].tolist(), strict=True):
@@ -205,21 +206,35 @@ def _sources(places: Sequence[Place], parts: Sequence[Sequence[int]]) -> list[st
 def _covariances(smoothed: Smoothed, prior: MotionPrior) -> list[Floats]:
     """(3, 3) of every pose; of those that nothing ties to the first one, what motion leaves open since the last that
     is; empty if nothing was aligned."""
-    if not smoothed.covariances:
-        return []
+    known = smoothed.covariances()
     tied = set(smoothed.parts[0]) if smoothed.parts else {0}
-    found: list[Floats] = [smoothed.covariances[0]]
-    for index, (before, place) in enumerate(pairwise(smoothed.places), 1):
-        if index in tied:
-            found.append(smoothed.covariances[index])
-            continue
-        step = prior.expect(place.motion, max(place.seconds, SHORTEST_S)).covariance
-        turn = np.eye(3)
-        turn[:2, :2] = before.pose[:2, :2]
-        x, y = (place.pose - before.pose)[:2, 3]
-        lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
-        found.append(np.asarray(lever @ found[-1] @ lever.T + turn @ step @ turn.T))
+    whole = np.zeros((6, 6))  # of the pose, and of the steady error of motion, which is the same in every step
+    found: list[Floats] = []
+    for index, covariance in enumerate(known):
+        if index == 0 or index in tied:
+            whole = np.zeros((6, 6))
+            whole[:3, :3], whole[3:, 3:] = covariance, prior.scale * prior.covariance
+        else:
+            whole = _grown(whole, smoothed.places[index - 1], smoothed.places[index], prior)
+        found.append(whole[:3, :3].copy())
     return found
+
+
+def _grown(whole: Floats, before: Place, place: Place, prior: MotionPrior) -> Floats:
+    """Covariance (6, 6) of pose and steady error after a step that motion alone tells."""
+    seconds = max(place.seconds, SHORTEST_S)
+    turn = np.eye(3)
+    turn[:2, :2] = before.pose[:2, :2]
+    x, y = (place.pose - before.pose)[:2, 3]
+    step = np.eye(6)
+    step[:3, :3] = [[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]]
+    random = prior.expect(None, seconds).covariance
+    if place.motion is not None:
+        step[:3, 3:] = turn * seconds
+        random = prior.scale * seconds * np.diag(noise_sigmas(prior.config) ** 2)
+    grown = step @ whole @ step.T
+    grown[:3, :3] += turn @ random @ turn.T
+    return np.asarray(grown)
 
 
 def _carried(other_from_own: SE2, error: Floats, own: SE2, own_error: Floats) -> Floats:

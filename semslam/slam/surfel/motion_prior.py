@@ -2,7 +2,8 @@
 
 Motion errs at random, growing with the root of time, and steadily: a wheel that is worn, a gyro that drifts. The steady
 part is the same all through a log, so every step whose true motion was seen by the camera tells about it (a Kalman
-filter of three numbers), and motion across a blind stretch comes out better for it.
+filter of three numbers), and motion across a blind stretch comes out better for it. So does it tell whether this robot
+errs more than it is said to, and by how much.
 """
 
 from __future__ import annotations
@@ -19,10 +20,16 @@ Floats = NDArray[np.float64]
 
 UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S = 0.4, 0.5
 """Standard deviations of the motion of a robot that does not tell it."""
+PAUSE_S = 5.0
+"""After a longer step the robot may have been parked, and its steady errors with it: no more of them is taken off."""
 _LONGEST_S = 60.0
 """In a longer step a robot that does not tell its motion gets no farther."""
 _GATE = 16.0
 """A step whose squared Mahalanobis distance exceeds this tells nothing of steady errors."""
+_BELIEVED = 3.0
+"""Steps that the configuration is worth when errors turn out larger than it says."""
+_MOST_SURPRISE = 30.0
+"""A squared Mahalanobis distance, over its three degrees of freedom, counts as no more than this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +51,15 @@ class MotionPrior:
     covariance: Floats = field(default_factory=lambda: np.zeros((3, 3)))
     speed: Floats = field(default_factory=lambda: np.zeros(3))
     """(3,) m/s, m/s and rad/s of the last step that was seen; a robot that tells no motion is thought to go on so."""
+    surprise: float = 0.0
+    """Sum of squared Mahalanobis distances of measured motion, each over its degrees of freedom, ..."""
+    steps: int = 0
+    """... and of how many steps."""
+
+    @property
+    def scale(self) -> float:
+        """How much larger the variances of this robot's motion are than the configuration says; 1 or more."""
+        return max(1.0, (_BELIEVED + self.surprise) / (_BELIEVED + self.steps))
 
     def __post_init__(self) -> None:
         self.covariance = np.diag(np.square(bias_sigmas(self.config)))
@@ -54,9 +70,9 @@ class MotionPrior:
             x, y, heading = self.speed * min(seconds, 1.0)
             away, turn = (speed * min(seconds, _LONGEST_S) for speed in (UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S))
             return Expected(SE2(x, y, wrap_angle(heading)), np.diag([away**2, away**2, turn**2]))
-        x, y, heading = np.array([motion.x_m, motion.y_m, motion.heading_rad]) - self.bias * seconds
+        x, y, heading = np.array([motion.x_m, motion.y_m, motion.heading_rad]) - self.bias * min(seconds, PAUSE_S)
         random = np.diag(np.square(noise_sigmas(self.config))) * seconds
-        return Expected(SE2(x, y, wrap_angle(heading)), random + seconds**2 * self.covariance)
+        return Expected(SE2(x, y, wrap_angle(heading)), self.scale * (random + seconds**2 * self.covariance))
 
     def see(self, seen: SE2, seconds: float) -> None:
         """Keep how fast the robot went."""
@@ -70,7 +86,11 @@ class MotionPrior:
         surprise = difference - self.bias * seconds
         noise = covariance + np.diag(np.square(noise_sigmas(self.config))) * seconds
         spread = seconds**2 * self.covariance + noise
-        if seconds <= 0 or surprise @ np.linalg.solve(spread, surprise) > _GATE:
+        squared = float(surprise @ np.linalg.solve(spread, surprise))
+        if seconds <= 0:
+            return
+        self.surprise, self.steps = self.surprise + min(squared / 3.0, _MOST_SURPRISE), self.steps + 1
+        if squared > _GATE * self.scale:
             return
         gain = seconds * self.covariance @ np.linalg.inv(spread)
         self.bias = self.bias + gain @ surprise

@@ -39,14 +39,17 @@ def rejoined(smoothed: Smoothed, seen: Sequence[Seen], grid: Grid) -> list[Place
 
 
 def without_specks(places: Sequence[Place]) -> list[Place]:
-    """Groups of fewer keyframes than can be looked for become part of the one before, and their links are forgotten:
-    alignment has to find them again."""
+    """Groups of fewer keyframes than can be looked for become part of the one before, where motion leads from there;
+    their links are forgotten: alignment has to find them again."""
     sizes = Counter(place.group for place in places if len(place.voxels))
-    kept, group = [], places[0].group
+    kept: list[Place] = []
     for place in places:
-        large = place.group == places[0].group or sizes[place.group] >= _LEAST
-        group = place.group if large else group
-        kept.append(replace(place, group=group, linked=place.linked and large))
+        if place.group == places[0].group or sizes[place.group] >= _LEAST:
+            kept.append(place)
+        else:
+            before = kept[-1]
+            there = moved(place, before.pose @ place.motion.matrix) if place.motion else place
+            kept.append(replace(there, group=before.group, linked=False))
     return kept
 
 

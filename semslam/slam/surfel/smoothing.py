@@ -8,8 +8,10 @@ keyframe that later ones hardly saw is still held by those that did.
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -18,7 +20,7 @@ from numpy.typing import NDArray
 
 from semslam.geometry.frames import Matrix, rotation_from_vector
 from semslam.slam.surfel.alignment import between, change_between, nudged, rotation_vector
-from semslam.slam.surfel.motion_prior import UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S, bias_sigmas, noise_sigmas
+from semslam.slam.surfel.motion_prior import PAUSE_S, UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S, bias_sigmas, noise_sigmas
 from semslam.slam.surfel.sight import agreement
 from semslam.slam.surfel.tracking import HELD_M, SHORTEST_S, Keyframe, Place, held, moved, shared_voxels, unlevel
 from semslam.stages.settings import SurfelConfig
@@ -38,6 +40,8 @@ DOUBT = 3.0
 """By how much covariances are larger than the equations say, since neighbouring surfels err alike, and the same ones in
 many pairs: of 10 simulated drives, 80 keyframes each, the squared Mahalanobis distance of the truth is then 0.8 of what
 it should be on average."""
+_MOST_MARGINALS = 500
+"""Poses whose covariance is worked out exactly: each takes longer, the more there are."""
 _FIXED = 1e8
 """Information that keeps the first keyframe where it is."""
 _HELD = 1e4
@@ -55,8 +59,14 @@ class Smoothed:
     """(3,) steady error of motion, m/s, m/s, rad/s."""
     ties: list[tuple[int, int]]
     """Keyframes that surfaces tie to each other."""
-    covariances: list[Floats] = field(default_factory=list)
-    """(3, 3) of each place's x, y and heading along the axes of the first one; empty if none was aligned."""
+    equations: _Equations | None = None
+    """The last ones; None if nothing was aligned."""
+    scale: float = 1.0
+    """How much larger the variances of motion are than the configuration says."""
+
+    def covariances(self) -> list[Floats]:
+        """(3, 3) of each place's x, y and heading along the axes of the first one; empty if nothing was aligned."""
+        return self.equations.covariances() if self.equations else []
 
     @property
     def parts(self) -> list[list[int]]:
@@ -83,10 +93,15 @@ def _root(group: list[int], index: int) -> int:
 
 
 def smooth(
-    places: Sequence[Place], bias: Floats, config: SurfelConfig, watch: Callable[[int], None] | None = None
+    places: Sequence[Place],
+    bias: Floats,
+    config: SurfelConfig,
+    watch: Callable[[int], None] | None = None,
+    scale: float = 1.0,
 ) -> Smoothed:
-    """Align all places with each other; `watch` hears of each round."""
-    result, equations = Smoothed(list(places), bias, []), None
+    """Align all places with each other; `watch` hears of each round. Variances of motion are `scale` times those of the
+    configuration."""
+    result = Smoothed(list(places), bias, [], scale=scale)
     for number in range(config.rounds):
         reach_m = _REACHES_M[min(number, len(_REACHES_M) - 1)]
         before, these = result, _equations(result, reach_m, config)
@@ -96,12 +111,12 @@ def smooth(
             after = _solved(result, these)
         if after is None:
             break
-        result, equations = after, these
+        result = after
         if watch:
             watch(number + 1)
         if number >= len(_REACHES_M) and _settled(before.places, result.places):
             break
-    return result if equations is None else replace(result, covariances=equations.covariances())
+    return result
 
 
 def _settled(before: Sequence[Place], after: Sequence[Place]) -> bool:
@@ -118,13 +133,14 @@ def _equations(before: Smoothed, reach_m: float, config: SurfelConfig, *, hold_a
     pairs = [pair for pair in pairs_of(places, config.neighbours) if _may_tie(places, *pair)]
     equations.ties = [pair for pair in pairs if _tie(equations, places, *pair, reach_m)]
     for part in replace(before, ties=equations.ties).parts[1:]:
-        if hold_all or all(places[index].motion is None for index in part if index - 1 not in part):
+        if hold_all or not _led_to(places, set(part)):
             _hold(equations, part[0])
     for index in range(len(places)):
         _level(equations, places, index, config)
         if index:
-            _move(equations, places, index, before.bias, config)
-    equations.add((equations.bias,), np.diag(1.0 / bias_sigmas(config) ** 2), before.bias / bias_sigmas(config) ** 2)
+            _move(equations, before, index, config)
+    known = before.scale * bias_sigmas(config) ** 2
+    equations.add((equations.bias,), np.diag(1.0 / known), before.bias / known)
     return equations
 
 
@@ -135,12 +151,18 @@ def _solved(before: Smoothed, equations: _Equations) -> Smoothed | None:
         return None
     poses = [nudged(place.pose, change) for place, change in zip(before.places, changes[:-1], strict=True)]
     after = [moved(place, pose) for place, pose in zip(before.places, poses, strict=True)]
-    return Smoothed(after, before.bias + changes[-1], equations.ties)
+    return Smoothed(after, before.bias + changes[-1], equations.ties, equations, before.scale)
 
 
 def _may_tie(places: Sequence[Place], first: int, second: int) -> bool:
     """Whether it is sure that they are near each other if their poses are."""
     return places[first].group == places[second].group
+
+
+def _led_to(places: Sequence[Place], part: set[int]) -> bool:
+    """Whether motion leads into a part, or out of it."""
+    into = any(places[index].motion for index in part if index and index - 1 not in part)
+    return into or any(places[index + 1].motion for index in part if index + 1 < len(places) and index + 1 not in part)
 
 
 def _hold(equations: _Equations, index: int) -> None:
@@ -169,7 +191,8 @@ def _tie(equations: _Equations, places: Sequence[Place], first: int, second: int
         return False
     seen = agreement(one.keyframe.sight, other.keyframe.sight, between(one.pose, other.pose))
     samples = len(one.keyframe.sight.points) + len(other.keyframe.sight.points)
-    if not seen.same_place(samples, sure=one.linked != other.linked):  # motion leads from neither to the other
+    near = (one.linked and other.linked) or second - first == 1  # else motion leads from neither to the other
+    if not seen.same_place(samples, sure=not near):
         return False
     there = _compare(equations, (first, one.keyframe, one.pose), (second, other.keyframe, other.pose), reach_m)
     back = _compare(equations, (second, other.keyframe, other.pose), (first, one.keyframe, one.pose), reach_m)
@@ -199,17 +222,17 @@ def _level(equations: _Equations, places: Sequence[Place], index: int, config: S
     equations.add((index,), weight, weight @ error)
 
 
-def _move(equations: _Equations, places: Sequence[Place], index: int, bias: Floats, config: SurfelConfig) -> None:
+def _move(equations: _Equations, known: Smoothed, index: int, config: SurfelConfig) -> None:
     """Motion between neighbours in time, less its steady error; of a robot that does not tell it, what is likely."""
-    before, place = places[index - 1], places[index]
+    before, place = known.places[index - 1], known.places[index]
     seconds = max(place.seconds, SHORTEST_S)
     if place.motion is None:
         x, y, turn, steady = 0.0, 0.0, 0.0, 0.0
         noise = np.array([UNKNOWN_SPEED_M_S, UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S]) ** 2 * seconds**2
     else:
         measured = np.array([place.motion.x_m, place.motion.y_m, place.motion.heading_rad])
-        x, y, turn = measured - bias * seconds
-        noise, steady = noise_sigmas(config) ** 2 * seconds, seconds
+        x, y, turn = measured - known.bias * min(seconds, PAUSE_S)
+        noise, steady = known.scale * noise_sigmas(config) ** 2 * seconds, min(seconds, PAUSE_S)
     shift = before.pose[:3, :3] @ np.array([x, y, 0.0])
     turned = before.pose[:3, :3] @ rotation_from_vector([0.0, 0.0, turn])
     error = np.concatenate(
@@ -261,7 +284,15 @@ class _Equations:
         return changes if all(np.isfinite(change).all() for change in changes) else None
 
     def covariances(self) -> list[Floats]:
-        """(3, 3) of x, y and heading of every pose."""
+        """(3, 3) of x, y and heading of every pose; of many, exactly of some, and of those between as of the worse one
+        beside them; empty if the equations do not determine them."""
         marginals = self._gtsam.Marginals(self._graph, self._gtsam.VectorValues())
-        keep = np.ix_([3, 4, 2], [3, 4, 2])
-        return [DOUBT * np.asarray(marginals.marginalCovariance(key))[keep] for key in range(self.bias)]
+        keep, step = np.ix_([3, 4, 2], [3, 4, 2]), math.ceil(self.bias / _MOST_MARGINALS)
+        exact = sorted({*range(0, self.bias, step), self.bias - 1})
+        try:
+            known = {key: DOUBT * np.asarray(marginals.marginalCovariance(key))[keep] for key in exact}
+        except RuntimeError:
+            return []
+        beside = [(exact[bisect_right(exact, key) - 1], exact[bisect_left(exact, key)]) for key in range(self.bias)]
+        found = [max((known[one], known[other]), key=np.trace) for one, other in beside]
+        return found if all(np.isfinite(one).all() for one in found) else []

@@ -19,7 +19,7 @@ from semslam.geometry.frames import SE2, Matrix, planar
 from semslam.slam.estimator import View
 from semslam.slam.health import JUMP_M, JUMP_M_PER_S
 from semslam.slam.surfel.alignment import Fit, Target, between, change_between, nudged
-from semslam.slam.surfel.motion_prior import Expected, MotionPrior
+from semslam.slam.surfel.motion_prior import PAUSE_S, Expected, MotionPrior
 from semslam.slam.surfel.sight import Agreement, Sight, agreement
 from semslam.slam.surfel.surfels import Surfels, surfels_of
 from semslam.stages.settings import SurfelConfig
@@ -30,8 +30,6 @@ SHORTEST_S = 1e-3
 """Between keyframes; stamps that repeat or run back count as this."""
 HELD_M = 0.1
 """Standard deviation along the floor up to which surfaces hold one keyframe to another: a floor alone tells heights."""
-_PAUSE_S = 5.0
-"""After a longer step the robot may have been parked."""
 _LONGEST_S = 60.0
 """Steps count as no longer than this where a robot's motion is bounded."""
 VOXEL_M = 0.25
@@ -53,6 +51,8 @@ _STARTS_KEPT = 2
 """Of the headings tried so many, or a quarter, are looked at closely."""
 _BESIDE_M = (-0.1, -0.05, 0.05, 0.1)
 _TIMES_BESIDE = 3
+_BRIDGED_M, _GRID_M, _FARTHEST_M = 0.25, 0.1, 0.6
+"""What alignment bridges from a wrong start; else places so far apart are looked at, up to so far away."""
 _REFERENCES = 3
 """Keyframes with whose pictures a pose must agree."""
 _WORTH = 300.0
@@ -60,9 +60,16 @@ _WORTH = 300.0
 _NEUTRAL = 0.9
 """What a sample counts that is not found again, in standard deviations: worse than one that is there, better than one
 that is not. So a pose from which little is seen of what is known must be all the more likely by motion."""
+_STRANGE = 6.0
+"""What a sample counts, beyond its difference, that hangs in space that was seen through: what is merely hidden may be
+so from elsewhere."""
 _TOO_FEW = 0.04
 """Share of samples that must be found again, or the pictures have nothing in common."""
 _MIN_MATCHES = 40
+_TOGETHER = 0.3
+"""Share of samples that two keyframes have in common which are surely near each other."""
+_WIDER = 9.0
+"""Variances are so many times larger in a second search."""
 _WIDE_M, _WIDE_RAD = 0.2, 0.35
 """Standard deviations of motion above which pictures alone must tell where a robot is ..."""
 _LOST_M, _LOST_RAD = 0.5, 0.6
@@ -160,22 +167,23 @@ class Track:
         if not any(len(place.voxels) for place in self.places):  # the first picture: there is nothing to find it in
             return self._remember(keyframe, start, seconds, motion, linked=keyframe is not None)
         starts = [start]
-        if seconds > _PAUSE_S and motion is not None:  # a parked robot's odometry rests, and its errors with it
+        if seconds > PAUSE_S and motion is not None:  # a parked robot's odometry rests, and its errors with it
             starts += [before.pose @ motion.matrix, before.pose]
-        found = self._find(keyframe, starts, self.open + expected.covariance, linked=True)
+        found = self._found(keyframe, starts, self.open + expected.covariance)
         if found is None:
             return self._go_on(keyframe, start, seconds, motion, expected)
-        if held(found[1]) < HELD_M**-2:  # along a corridor motion tells the way; across it the walls do
+        if held(found.hessian) < HELD_M**-2:  # along a corridor motion tells the way; across it the walls do
             self.open = self.open + expected.covariance
-            return self._remember(keyframe, found[0], seconds, motion, linked=False)
-        if _lost(self.open + expected.covariance) or self.parked:
+            return self._remember(keyframe, found.pose, seconds, motion, linked=False)
+        doubtful = self.parked or _lost(self.open + expected.covariance)
+        if keyframe and doubtful and not _seen_together(before, keyframe, found.pose):
             self.group += 1
         self.open, self.parked = np.zeros((3, 3)), False
-        pose, hessian = found
+        pose, hessian = found.pose, found.hessian
         if before.linked:
             seen = planar(between(before.pose, pose))
             self.prior.see(seen, seconds)
-            if motion is not None and seconds <= _PAUSE_S:
+            if motion is not None and seconds <= PAUSE_S:
                 self.prior.learn(motion, seconds, seen, _covariance_in_robot(hessian, before.pose))
         return self._remember(keyframe, pose, seconds, motion, linked=True)
 
@@ -186,8 +194,8 @@ class Track:
         found = self._find(keyframe, [start], expected.covariance, linked=False)
         if found is None:
             self.open = self.open + expected.covariance
-        self.parked |= seconds > _PAUSE_S
-        return self._remember(keyframe, start if found is None else found[0], seconds, motion, linked=False)
+        self.parked |= seconds > PAUSE_S
+        return self._remember(keyframe, start if found is None else found.pose, seconds, motion, linked=False)
 
     def _remember(
         self, keyframe: Keyframe | None, pose: Matrix, seconds: float, motion: SE2 | None, *, linked: bool
@@ -196,10 +204,18 @@ class Track:
         self.places.append(place)
         return place
 
+    def _found(self, keyframe: Keyframe | None, starts: Sequence[Matrix], covariance: Floats) -> Found | None:
+        """The pose among linked keyframes; where it is not sure, motion may err more than it is thought to."""
+        found = self._find(keyframe, starts, covariance, linked=True)
+        if keyframe is None or (found and found.sure):
+            return found
+        wider = self._find(keyframe, starts, _WIDER * covariance, linked=True)
+        return wider if wider and (wider.sure or not found) else found
+
     def _find(
         self, keyframe: Keyframe | None, starts: Sequence[Matrix], covariance: Floats, *, linked: bool
-    ) -> tuple[Matrix, Floats] | None:
-        """Pose and Hessian (6, 6) of the surfaces alone; None if none of what was seen before, linked or not, fits."""
+    ) -> Found | None:
+        """The pose among what was seen before, linked or not; None if it does not fit anywhere."""
         if keyframe is None:
             return None
         near = self._near(placed(keyframe, starts[0], 0.0, None, linked=False), linked=linked)
@@ -216,6 +232,16 @@ class Track:
         return [self.places[index] for index in others[: self._config.neighbours]]
 
 
+def _seen_together(before: Place, keyframe: Keyframe, pose: Matrix) -> bool:
+    """Whether a keyframe shows much of what the one before it did, whose place is known: then it is near, whatever
+    motion leaves open."""
+    if not before.linked or before.keyframe is None:
+        return False
+    seen = agreement(before.keyframe.sight, keyframe.sight, between(before.pose, pose))
+    samples = len(before.keyframe.sight.points) + len(keyframe.sight.points)
+    return seen.same_place(samples, sure=True) and seen.told > _TOGETHER * samples
+
+
 def _lost(covariance: Floats) -> bool:
     """Whether motion leaves so much open that a single keyframe may be found in the wrong place."""
     return bool(covariance[:2, :2].max() > _LOST_M**2 or covariance[2, 2] > _LOST_RAD**2)
@@ -229,6 +255,17 @@ def shared_voxels(places: Sequence[Place], place: Place) -> dict[int, int]:
     near = np.argsort(away, kind="stable")[:_COMPARED]  # NaN comes last
     counts = {int(i): len(np.intersect1d(place.voxels, places[i].voxels, assume_unique=True)) for i in near}
     return {index: count for index, count in counts.items() if count}
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Where a keyframe was found."""
+
+    pose: Matrix
+    hessian: Floats
+    """(6, 6) of the surfaces alone."""
+    sure: bool
+    """Whether pictures alone would do to tell."""
 
 
 class Search:
@@ -259,16 +296,16 @@ class Search:
         shift = 1.0 / self._sigma_m**2
         self._motion = np.diag([0.0, 0.0, 1.0 / self._sigma_rad**2, shift, shift, 0.0])
 
-    def result(self) -> tuple[Matrix, Floats] | None:
-        """The best pose and its Hessian; None if none will do."""
+    def result(self) -> Found | None:
+        """The best pose; None if none will do."""
         poses = [self._refined(start, _COARSE_ROUNDS, coarse=True)[0] for start in self._starts()]
         pose = min(poses, key=self._cost)
-        pose = self._beside(pose)
+        pose = self._beside(self._around(pose))
         pose, fit = self._refined(pose, _ROUNDS, coarse=False)
         seen = self._agreement(pose)
         if len(fit) < _MIN_MATCHES or self._too_few(seen) or not seen.same_place(self._samples, sure=self._wide):
             return None
-        return pose, fit.equations(pose[:3, 3])[0]
+        return Found(pose, fit.equations(pose[:3, 3])[0], seen.same_place(self._samples, sure=True))
 
     def _starts(self) -> list[Matrix]:
         """Headings that agree best, none beside another; and, since only what is nearly right already agrees well, some
@@ -285,6 +322,16 @@ class Search:
                 best.append(turn)
         turned = [self._start @ SE2(0.0, 0.0, turn * step).matrix for turn in sorted(kept | set(best))]
         return [*turned, *self._others]
+
+    def _around(self, pose: Matrix) -> Matrix:
+        """Where motion leaves more open than alignment bridges: look all around, begin again from the best place."""
+        reach = min(_OPEN_SIGMAS * self._sigma_m, _FARTHEST_M)
+        if reach <= _BRIDGED_M:
+            return pose
+        line = np.linspace(-reach, reach, 2 * math.ceil(reach / _GRID_M) + 1)
+        places = [nudged(pose, np.array([0.0, 0.0, 0.0, x, y, 0.0])) for x in line.tolist() for y in line.tolist()]
+        best = min(places, key=self._cost)
+        return min((pose, self._refined(best, _COARSE_ROUNDS, coarse=True)[0]), key=self._cost)
 
     def _beside(self, pose: Matrix) -> Matrix:
         """Look left and right along the direction that the surfaces hold worst, as long as that gets better."""
@@ -327,7 +374,7 @@ class Search:
         """Of pictures that disagree and of motion that is unlikely."""
         seen = self._agreement(pose)
         rest = max(0, self._samples - seen.looked_up)
-        mean = (seen.difference + _NEUTRAL * rest) / max(1, self._samples)
+        mean = (seen.difference + _STRANGE * seen.strangers + _NEUTRAL * rest) / max(1, self._samples)
         error = change_between(self._start, pose)
         return _WORTH * mean + 0.5 * float(error @ self._motion @ error)
 
