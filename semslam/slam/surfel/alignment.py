@@ -51,7 +51,7 @@ class Target:
         source = np.flatnonzero((np.asarray(squared).ravel() < reach_m**2) & (cosine > _SAME_WAY))
         near = near[source]
         normals = moved.normals[source] + self.surfels.normals[near]
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
         points = moved.points[source]
         distance = np.einsum("ij,ij->i", normals, points - self.surfels.points[near])
         sigma = np.hypot(moved.sigma_m[source], self.surfels.sigma_m[near])
@@ -82,24 +82,28 @@ class Fit:
 
     def equations(self, about: Floats) -> tuple[Floats, Floats]:
         """Hessian (6, 6) and gradient (6,) for a turn (3) of the source about a point (3,) and a shift (3)."""
-        turned = np.cross(self.points - about, self.normals)
-        return _equations(np.concatenate([turned, self.normals], 1), self.distance_m, self.weights)
-
-    def pair_equations(self, about_source: Floats, about_target: Floats) -> tuple[Floats, Floats]:
-        """Hessian (12, 12) and gradient (12,) for the source's turn and shift, then the target's."""
-        source = np.concatenate([np.cross(self.points - about_source, self.normals), self.normals], 1)
-        target = -np.concatenate([np.cross(self.points - about_target, self.normals), self.normals], 1)
-        return _equations(np.concatenate([source, target], 1), self.distance_m, self.weights)
-
-    def turned(self, frame_from_target: Matrix) -> Fit:
-        """The same in another frame."""
-        rotation, offset = frame_from_target[:3, :3], frame_from_target[:3, 3]
-        return Fit(self.points @ rotation.T + offset, self.normals @ rotation.T, self.distance_m, self.sigma_m)
+        x, y, z = (self.points - about).T
+        a, b, c = self.normals.T
+        jacobian = np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c])  # (6, K)
+        weighted = jacobian * self.weights
+        return weighted @ jacobian.T, weighted @ self.distance_m
 
 
-def _equations(jacobian: Floats, distance: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    weighted = jacobian * weights[:, None]
-    return weighted.T @ jacobian, weighted.T @ distance
+def pair_equations(
+    hessian: Floats, gradient: Floats, target_from_source: Matrix, parent_from_target: Matrix
+) -> tuple[Floats, Floats]:
+    """Hessian (12, 12) and gradient (12,) for changes of the source's pose, then of the target's, along their parent's
+    axes; from those (6, 6) and (6,) of the source's alone, about its origin, along the target's axes.
+
+    A turn of the target about its own origin moves the source's along with it: J_target = -J_source A.
+    """
+    x, y, z = target_from_source[:3, 3]
+    whole = np.zeros((6, 12))
+    whole[:, :6] = np.eye(6)
+    whole[:, 6:] = -np.eye(6)
+    whole[3:, 6:9] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    whole = whole @ np.kron(np.eye(4), parent_from_target[:3, :3].T)
+    return whole.T @ hessian @ whole, whole.T @ gradient
 
 
 def nudged(pose: Matrix, change: Floats) -> Matrix:

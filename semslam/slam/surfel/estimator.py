@@ -25,7 +25,8 @@ from semslam.slam.surfel.rejoining import rejoined, without_specks
 from semslam.slam.surfel.sight import Sight
 from semslam.slam.surfel.smoothing import Smoothed, smooth
 from semslam.slam.surfel.surfels import Surfels
-from semslam.slam.surfel.tracking import SHORTEST_S, Keyframe, Place, Track, moved, placed
+from semslam.slam.surfel.tracking import SHORTEST_S, Anchor, Keyframe, Place, Track, moved, placed
+from semslam.slam.surfel.uncertainty import along, lever, turn_of
 from semslam.stages.settings import SurfelConfig
 
 _Arrays = dict[str, NDArray[Any]]
@@ -59,10 +60,10 @@ class SurfelEstimator:
         """Take the next keyframe."""
         seconds = (step.stamp_nanos - self._stamps[-1]) / 1e9 if self._stamps else 0.0
         keyframe = Keyframe.of(step.view, self._config) if step.view else None
-        self._track.step(keyframe, step.motion, max(0.0, seconds))
+        place = self._track.step(keyframe, step.motion, max(0.0, seconds))
         self._frames.append(step.frame)
         self._stamps.append(step.stamp_nanos)
-        self._seen.append(Seen.of(step.observation))
+        self._seen.append(Seen.of(None if place.anchor else step.observation))
 
     def finish(self, watch: Callable[[int], None] | None = None) -> list[PoseEstimate]:
         """The poses of all keyframes; `watch` hears of each round over them."""
@@ -182,7 +183,7 @@ class SurfelEstimator:
             self._track.group, self._track.parked = int(arrays["group"][0]), bool(arrays["group"][1])
             for frame, stamp in zip(arrays["frames"].tolist(), arrays["stamps"].tolist(), strict=True):
                 place, seen = _unpacked(arrays[str(len(self._stamps))].tobytes())
-                self._track.places.append(place)
+                self._track.recall(place)
                 self._seen.append(seen)
                 self._frames.append(frame)
                 self._stamps.append(stamp)
@@ -223,27 +224,24 @@ def _covariances(smoothed: Smoothed, prior: MotionPrior) -> list[Floats]:
 def _grown(whole: Floats, before: Place, place: Place, prior: MotionPrior) -> Floats:
     """Covariance (6, 6) of pose and steady error after a step that motion alone tells."""
     seconds = max(place.seconds, SHORTEST_S)
-    turn = np.eye(3)
-    turn[:2, :2] = before.pose[:2, :2]
     x, y = (place.pose - before.pose)[:2, 3]
     step = np.eye(6)
-    step[:3, :3] = [[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]]
+    step[:3, :3] = lever(float(x), float(y))
     random = prior.expect(None, seconds).covariance
     if place.motion is not None:
-        step[:3, 3:] = turn * seconds
+        step[:3, 3:] = turn_of(before.pose) * seconds
         random = prior.scale * seconds * np.diag(noise_sigmas(prior.config) ** 2)
-    grown = step @ whole @ step.T
-    grown[:3, :3] += turn @ random @ turn.T
-    return np.asarray(grown)
+    after = step @ whole @ step.T
+    after[:3, :3] += along(random, before.pose)
+    return np.asarray(after)
 
 
 def _carried(other_from_own: SE2, error: Floats, own: SE2, own_error: Floats) -> Floats:
     """Covariance (3, 3) of a pose in another map, from those of the map's place there and of the pose in its own."""
-    turn = np.eye(3)
-    turn[:2, :2] = other_from_own.matrix[:2, :2]
-    x, y = turn[:2, :2] @ [own.x_m, own.y_m]
-    lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
-    return np.asarray(lever @ error @ lever.T + turn @ own_error @ turn.T)
+    there = other_from_own.matrix
+    x, y = there[:2, :2] @ [own.x_m, own.y_m]
+    arm = lever(float(x), float(y))
+    return np.asarray(arm @ error @ arm.T + along(own_error, there))
 
 
 def _packed(place: Place, seen: Seen) -> bytes:
@@ -256,6 +254,9 @@ def _packed(place: Place, seen: Seen) -> bytes:
         "cells": seen.cells,
         "weights": seen.weights,
     }
+    if place.anchor:
+        arrays |= {"anchor": np.array(place.anchor.index), "anchor_from_robot": place.anchor.anchor_from_robot}
+        arrays["hessian"] = place.anchor.hessian
     if place.keyframe:
         surfels = place.keyframe.surfels
         arrays |= {name: getattr(surfels, name).astype(np.float32) for name in ("points", "normals", "sigma_m")}
@@ -273,4 +274,7 @@ def _unpacked(packed: bytes) -> tuple[Place, Seen]:
     linked, group = arrays["linked"].tolist()
     seconds = arrays["seconds"].item()
     place = placed(keyframe, arrays["pose"], seconds, motion, linked=bool(linked), group=group)
+    if "anchor" in arrays:
+        tied = Anchor(int(arrays["anchor"]), arrays["anchor_from_robot"], arrays["hessian"])
+        place = replace(place, anchor=tied)
     return place, Seen(arrays["cells"], arrays["weights"])

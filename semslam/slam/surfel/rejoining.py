@@ -41,7 +41,7 @@ def rejoined(smoothed: Smoothed, seen: Sequence[Seen], grid: Grid) -> list[Place
 def without_specks(places: Sequence[Place]) -> list[Place]:
     """Groups of fewer keyframes than can be looked for become part of the one before, where motion leads from there;
     their links are forgotten: alignment has to find them again."""
-    sizes = Counter(place.group for place in places if len(place.voxels))
+    sizes = Counter(place.group for place in places if place.pictured)
     kept: list[Place] = []
     for place in places:
         if place.group == places[0].group or sizes[place.group] >= _LEAST:
@@ -49,7 +49,7 @@ def without_specks(places: Sequence[Place]) -> list[Place]:
         else:
             before = kept[-1]
             there = moved(place, before.pose @ place.motion.matrix) if place.motion else place
-            kept.append(replace(there, group=before.group, linked=False))
+            kept.append(replace(there, group=before.group, linked=False, anchor=None))
     return kept
 
 

@@ -8,17 +8,17 @@ nothing is said.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from semslam.geometry.frames import Matrix, invert
 from semslam.slam.estimator import View
-
-Floats = NDArray[np.float64]
 
 _COLUMNS = 160
 """Samples along a row of the picture, about; every second of every second row is looked up."""
@@ -29,6 +29,9 @@ WORST = 1.6
 """Mean difference, in standard deviations, above which two pictures do not show the same place."""
 _MOST = 3.0
 """A larger difference counts as this."""
+_NOWHERE = np.float32(-1e4)
+"""A pixel outside of any picture."""
+_LONGEST_ROW = 1024
 _STRANGERS, _STRANGERS_SURE = 0.12, 0.05
 """Share of samples that hang in space that was seen through, up to which two pictures may show the same place: people
 walk. At right poses it is 0.01 in simulated homes and 0.04 in a real recording; at wrong ones, found in logs of robots
@@ -68,8 +71,14 @@ class Agreement:
             samples: of the pictures, wherever they fall.
             sure: the pictures alone must tell; else motion says the same already.
         """
-        most, least = (_STRANGERS_SURE, _TOLD_SURE * samples) if sure else (_STRANGERS, 1)
-        return self.mean <= WORST and self.told >= least and self.strangers <= most * self.told
+        if sure:
+            return self.alike and self.told >= _TOLD_SURE * samples
+        return self.mean <= WORST and self.told >= 1 and self.strangers <= _STRANGERS * self.told
+
+    @property
+    def alike(self) -> bool:
+        """Whether hardly anything of what the pictures have in common speaks against their showing one place."""
+        return self.mean <= WORST and self.told >= 1 and self.strangers <= _STRANGERS_SURE * self.told
 
     def __add__(self, other: Agreement) -> Agreement:
         return Agreement(
@@ -101,31 +110,32 @@ class Sight:
         return Sight(thinned, (view.fx / step, view.fy / step, *inner), view.robot_from_camera)
 
     @cached_property
-    def points(self) -> Floats:
+    def points(self) -> NDArray[np.float32]:
         """(M, 3) robot frame, of every second sample of every second row."""
         rows, columns = np.nonzero(self.depth_m[::2, ::2])
         depth = self.depth_m[::2, ::2][rows, columns].astype(np.float64)
         fx, fy, cx, cy = self.intrinsics
         x, y = (2 * columns - cx) / fx, (2 * rows - cy) / fy
         in_camera = np.stack([x, y, np.ones_like(x)], 1) * depth[:, None]
-        return in_camera @ self.robot_from_camera[:3, :3].T + self.robot_from_camera[:3, 3]
+        in_robot = in_camera @ self.robot_from_camera[:3, :3].T + self.robot_from_camera[:3, 3]
+        return in_robot.astype(np.float32)
 
-    def look_up(self, points: Floats, robot_from_points: Matrix) -> Agreement:
+    def look_up(self, points: NDArray[np.float32], robot_from_points: Matrix) -> Agreement:
         """Points (M, 3) of another frame in this picture."""
-        camera_from_points = invert(self.robot_from_camera) @ robot_from_points
-        x, y, depth = (points @ camera_from_points[:3, :3].T + camera_from_points[:3, 3]).T
-        ahead = np.flatnonzero(depth > _NEAREST_M)
-        x, y, depth = x[ahead], y[ahead], depth[ahead]
-        fx, fy, cx, cy = self.intrinsics
-        column, row = (np.rint(value).astype(np.int64) for value in (x / depth * fx + cx, y / depth * fy + cy))
-        height, width = self.depth_m.shape
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        measured = self.depth_m[row[inside], column[inside]].astype(np.float64)
+        if not len(points):
+            return Agreement(0.0, 0)
+        camera_from_points = (invert(self.robot_from_camera) @ robot_from_points).astype(np.float32)
+        x, y, depth = camera_from_points[:3, :3] @ points.T + camera_from_points[:3, 3:]
+        ahead = depth > _NEAREST_M
+        scale = np.divide(np.float32(1.0), depth, out=np.zeros_like(depth), where=ahead)
+        fx, fy, cx, cy = (np.float32(value) for value in self.intrinsics)
+        column, row = np.where(ahead, x * scale * fx + cx, _NOWHERE), y * scale * fy + cy
+        measured = _sampled(self.depth_m, column, row)
         known = measured > 0
-        measured, depth = measured[known], depth[inside][known]
-        behind = (depth - measured) / (_NOISE_M + _NOISE_PER_M * measured**2)
-        difference = np.minimum(np.abs(behind), _MOST).sum()
-        return Agreement(float(difference), len(behind), int((behind >= _MOST).sum()), int((behind <= -_MOST).sum()))
+        measured, depth = measured[known], depth[known]
+        behind = (depth - measured) / (_NOISE_M + _NOISE_PER_M * measured * measured)
+        difference = float(np.minimum(np.abs(behind), _MOST).sum(dtype=np.float64))
+        return Agreement(difference, len(behind), int((behind >= _MOST).sum()), int((behind <= -_MOST).sum()))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Everything, to be kept."""
@@ -140,6 +150,16 @@ class Sight:
         """The inverse of `arrays`."""
         fx, fy, cx, cy = arrays["intrinsics"].tolist()
         return Sight(arrays["depth"], (fx, fy, cx, cy), arrays["robot_from_camera"])
+
+
+def _sampled(image: NDArray[np.float32], column: NDArray[np.float32], row: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(M,) the nearest pixels; 0 outside."""
+    rows = math.ceil(len(column) / _LONGEST_ROW)  # of the maps that remap takes, which are bounded
+    where = np.full((2, rows * _LONGEST_ROW), _NOWHERE, np.float32)
+    where[0, : len(column)], where[1, : len(row)] = column, row
+    maps = where.reshape(2, rows, _LONGEST_ROW)
+    found = cv2.remap(image, maps[0], maps[1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
+    return np.asarray(found, np.float32).ravel()[: len(column)]
 
 
 def agreement(first: Sight, second: Sight, first_from_second: Matrix) -> Agreement:

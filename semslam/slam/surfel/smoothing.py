@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.geometry.frames import Matrix, rotation_from_vector
-from semslam.slam.surfel.alignment import between, change_between, nudged, rotation_vector
+from semslam.geometry.frames import SE2, Matrix
+from semslam.slam.surfel.alignment import change_between, nudged, pair_equations
+from semslam.slam.surfel.comparisons import Comparison, Comparisons
 from semslam.slam.surfel.motion_prior import PAUSE_S, UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S, bias_sigmas, noise_sigmas
-from semslam.slam.surfel.sight import agreement
-from semslam.slam.surfel.tracking import HELD_M, SHORTEST_S, Keyframe, Place, held, moved, shared_voxels, unlevel
+from semslam.slam.surfel.tracking import SHORTEST_S, Place, moved, shared_voxels, unlevel
 from semslam.stages.settings import SurfelConfig
 
 Floats = NDArray[np.float64]
@@ -31,7 +31,6 @@ _REACHES_M = (0.15, 0.1, 0.08, 0.06)
 """Of the rounds; later ones reach as far as the last."""
 _LEAST_SHARED = 0.15
 """Share of the smaller one's voxels that two keyframes must have in common."""
-_MIN_MATCHES = 30
 _MOST_SIGMAS = 5.0
 """Motion that is farther off than this has less than half of its weight (Cauchy): slipping wheels, a parked robot."""
 _STILL = 1e-3
@@ -72,11 +71,12 @@ class Smoothed:
     def parts(self) -> list[list[int]]:
         """Keyframes with pictures that surfaces tie together, over whatever others: in the end, or when they were
         taken and it was sure. Each part rising, in the order of their first ones."""
-        pictured = [index for index, place in enumerate(self.places) if len(place.voxels)]
+        pictured = [index for index, place in enumerate(self.places) if place.pictured]
         group = list(range(len(self.places)))
         linked = [index for index in pictured if self.places[index].linked]
         walked = [pair for pair in pairwise(linked) if _may_tie(self.places, *pair)]
-        for first, second in (*self.ties, *walked):
+        anchored = [(place.anchor.index, index) for index, place in enumerate(self.places) if place.anchor]
+        for first, second in (*self.ties, *walked, *anchored):
             one, other = _root(group, first), _root(group, second)
             group[max(one, other)] = min(one, other)
         found: dict[int, list[int]] = {}
@@ -101,13 +101,13 @@ def smooth(
 ) -> Smoothed:
     """Align all places with each other; `watch` hears of each round. Variances of motion are `scale` times those of the
     configuration."""
-    result = Smoothed(list(places), bias, [], scale=scale)
+    result, comparisons = Smoothed(list(places), bias, [], scale=scale), Comparisons()
     for number in range(config.rounds):
         reach_m = _REACHES_M[min(number, len(_REACHES_M) - 1)]
-        before, these = result, _equations(result, reach_m, config)
+        before, these = result, _equations(result, reach_m, config, comparisons)
         after = _solved(result, these)
         if after is None:  # motion that leads to some part is so doubtful that it is none
-            these = _equations(result, reach_m, config, hold_all=True)
+            these = _equations(result, reach_m, config, comparisons, hold_all=True)
             after = _solved(result, these)
         if after is None:
             break
@@ -125,13 +125,16 @@ def _settled(before: Sequence[Place], after: Sequence[Place]) -> bool:
     return bool(np.abs(changes).max(initial=0.0) < _STILL)
 
 
-def _equations(before: Smoothed, reach_m: float, config: SurfelConfig, *, hold_all: bool = False) -> _Equations:
+def _equations(
+    before: Smoothed, reach_m: float, config: SurfelConfig, comparisons: Comparisons, *, hold_all: bool = False
+) -> _Equations:
     """What surfaces, levels and motion tell of all poses where they are now; parts that nothing ties to the others are
     kept where they are if no motion leads there, or all of them."""
     places = before.places
     equations = _Equations(len(places))
     pairs = [pair for pair in pairs_of(places, config.neighbours) if _may_tie(places, *pair)]
-    equations.ties = [pair for pair in pairs if _tie(equations, places, *pair, reach_m)]
+    compared = ((pair, comparisons.of(places, *pair, reach_m)) for pair in pairs)
+    equations.ties = [pair for pair, comparison in compared if _tie(equations, places, pair, comparison)]
     for part in replace(before, ties=equations.ties).parts[1:]:
         if hold_all or not _led_to(places, set(part)):
             _hold(equations, part[0])
@@ -139,6 +142,7 @@ def _equations(before: Smoothed, reach_m: float, config: SurfelConfig, *, hold_a
         _level(equations, places, index, config)
         if index:
             _move(equations, before, index, config)
+        _anchor(equations, places, index)
     known = before.scale * bias_sigmas(config) ** 2
     equations.add((equations.bias,), np.diag(1.0 / known), before.bias / known)
     return equations
@@ -184,33 +188,13 @@ def pairs_of(places: Sequence[Place], most: int) -> list[tuple[int, int]]:
     return sorted(found)
 
 
-def _tie(equations: _Equations, places: Sequence[Place], first: int, second: int, reach_m: float) -> bool:
-    """Compare the surfels of two keyframes, either way round; False if they do not see the same after all."""
-    one, other = places[first], places[second]
-    if not (one.keyframe and other.keyframe):
-        return False
-    seen = agreement(one.keyframe.sight, other.keyframe.sight, between(one.pose, other.pose))
-    samples = len(one.keyframe.sight.points) + len(other.keyframe.sight.points)
-    near = (one.linked and other.linked) or second - first == 1  # else motion leads from neither to the other
-    if not seen.same_place(samples, sure=not near):
-        return False
-    there = _compare(equations, (first, one.keyframe, one.pose), (second, other.keyframe, other.pose), reach_m)
-    back = _compare(equations, (second, other.keyframe, other.pose), (first, one.keyframe, one.pose), reach_m)
-    return there or back
-
-
-def _compare(
-    equations: _Equations, source: tuple[int, Keyframe, Matrix], target: tuple[int, Keyframe, Matrix], reach_m: float
-) -> bool:
-    """Lay one keyframe's surfels on another's. False if too few come to lie there, or if they leave it free to slide: a
-    floor alone tells heights, not places."""
-    (index, keyframe, pose), (toward, known, place) = source, target
-    fit = known.target.fit(keyframe.surfels.moved(between(place, pose)), reach_m)
-    if len(fit) < _MIN_MATCHES:
-        return False
-    hessian, gradient = fit.turned(place).pair_equations(pose[:3, 3], place[:3, 3])
-    equations.add((index, toward), hessian, gradient)
-    return bool(held(hessian[:6, :6]) > HELD_M**-2)
+def _tie(equations: _Equations, places: Sequence[Place], pair: tuple[int, int], comparison: Comparison) -> bool:
+    """Tell what the surfaces of two keyframes do; False if they do not tie them after all."""
+    for laid, (source, target) in ((comparison.there, pair), (comparison.back, pair[::-1])):
+        if laid:
+            pose = places[target].pose
+            equations.add((source, target), *pair_equations(laid.hessian, laid.gradient, laid.target_from_source, pose))
+    return comparison.ties
 
 
 def _level(equations: _Equations, places: Sequence[Place], index: int, config: SurfelConfig) -> None:
@@ -233,21 +217,37 @@ def _move(equations: _Equations, known: Smoothed, index: int, config: SurfelConf
         measured = np.array([place.motion.x_m, place.motion.y_m, place.motion.heading_rad])
         x, y, turn = measured - known.bias * min(seconds, PAUSE_S)
         noise, steady = known.scale * noise_sigmas(config) ** 2 * seconds, min(seconds, PAUSE_S)
-    shift = before.pose[:3, :3] @ np.array([x, y, 0.0])
-    turned = before.pose[:3, :3] @ rotation_from_vector([0.0, 0.0, turn])
-    error = np.concatenate(
-        [rotation_vector(place.pose[:3, :3] @ turned.T), place.pose[:3, 3] - before.pose[:3, 3] - shift]
-    )
+    error, of_poses = _off(before.pose, place.pose, SE2(x, y, turn).matrix)
     jacobian = np.zeros((6, 15))  # of a change of the pose before, of this one, and of the bias
-    jacobian[:, 6:12] = np.eye(6)
-    jacobian[:3, :3] = jacobian[3:, 3:6] = -np.eye(3)
-    jacobian[3:, :3] = [[0, -shift[2], shift[1]], [shift[2], 0, -shift[0]], [-shift[1], shift[0], 0]]
+    jacobian[:, :12] = of_poses
     jacobian[2, 14] = steady
     jacobian[3:, 12:14] = before.pose[:3, :2] * steady
     doubt = 1.0 + float((error[[2, 3, 4]] ** 2 / noise[[2, 0, 1]]).sum()) / _MOST_SIGMAS**2
     weight = np.diag([_FREE, _FREE, 1 / noise[2], 1 / noise[0], 1 / noise[1], _FREE]) / doubt
     weighted = jacobian.T @ weight
     equations.add((index - 1, index, equations.bias), weighted @ jacobian, weighted @ error)
+
+
+def _anchor(equations: _Equations, places: Sequence[Place], index: int) -> None:
+    """A keyframe whose pictures were not kept stays where it was found beside its anchor."""
+    anchor, pose = places[index].anchor, places[index].pose
+    if anchor is None:
+        return
+    known = places[anchor.index].pose
+    error, jacobian = _off(known, pose, anchor.anchor_from_robot)
+    turn = np.kron(np.eye(2), known[:3, :3])
+    weighted = jacobian.T @ turn @ anchor.hessian @ turn.T
+    equations.add((anchor.index, index), weighted @ jacobian, weighted @ error)
+
+
+def _off(first: Matrix, second: Matrix, first_from_second: Matrix) -> tuple[Floats, Floats]:
+    """(6,) how far a pose is from where another and the way between them put it, and (6, 12) how that depends on
+    changes of both."""
+    error = change_between(first @ first_from_second, second)
+    x, y, z = first[:3, :3] @ first_from_second[:3, 3]
+    jacobian = np.concatenate([-np.eye(6), np.eye(6)], 1)
+    jacobian[3:, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    return error, jacobian
 
 
 class _Equations:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,9 +19,11 @@ from semslam.geometry.frames import SE2, Matrix, planar
 from semslam.slam.estimator import View
 from semslam.slam.health import JUMP_M, JUMP_M_PER_S
 from semslam.slam.surfel.alignment import Fit, Target, between, change_between, nudged
+from semslam.slam.surfel.coverage import Coverage, voxel_numbers
 from semslam.slam.surfel.motion_prior import PAUSE_S, Expected, MotionPrior
 from semslam.slam.surfel.sight import Agreement, Sight, agreement
 from semslam.slam.surfel.surfels import Surfels, surfels_of
+from semslam.slam.surfel.uncertainty import along, grown
 from semslam.stages.settings import SurfelConfig
 
 Floats = NDArray[np.float64]
@@ -66,10 +68,14 @@ so from elsewhere."""
 _TOO_FEW = 0.04
 """Share of samples that must be found again, or the pictures have nothing in common."""
 _MIN_MATCHES = 40
+_TINY = 1e-12
+"""Share of a Hessian that keeps parts of it solvable of which it says nothing."""
 _TOGETHER = 0.3
 """Share of samples that two keyframes have in common which are surely near each other."""
 _WIDER = 9.0
 """Variances are so many times larger in a second search."""
+_CLEARLY = 0.3
+"""Standard deviations by which the mean difference of one pose is smaller than that of another that is worse."""
 _WIDE_M, _WIDE_RAD = 0.2, 0.35
 """Standard deviations of motion above which pictures alone must tell where a robot is ..."""
 _LOST_M, _LOST_RAD = 0.5, 0.6
@@ -99,6 +105,18 @@ class Keyframe:
         return self.surfels.every(_COARSE)
 
 
+@dataclass(frozen=True, eq=False)
+class Anchor:
+    """To what a keyframe is tied whose pictures were not kept."""
+
+    index: int
+    """Of a keyframe whose pictures were."""
+    anchor_from_robot: Matrix
+    """As it was found."""
+    hessian: Floats
+    """(6, 6) of surfaces, for a turn and a shift along the axes of the anchor."""
+
+
 @dataclass(eq=False)
 class Place:
     """A keyframe and where it was taken; without pictures there is only the place."""
@@ -119,6 +137,13 @@ class Place:
     group: int = 0
     """Keyframes of different groups may lie where they do by mistake: a robot that did not know where it was found
     itself by few pictures."""
+    anchor: Anchor | None = None
+    """Of one whose pictures were left out since they showed nothing new."""
+
+    @property
+    def pictured(self) -> bool:
+        """Whether pictures tell where it is."""
+        return bool(len(self.voxels)) or self.anchor is not None
 
 
 def placed(
@@ -133,7 +158,8 @@ def placed(
 
 def moved(place: Place, pose: Matrix) -> Place:
     """The same keyframe somewhere else."""
-    return placed(place.keyframe, pose, place.seconds, place.motion, linked=place.linked, group=place.group)
+    there = placed(place.keyframe, pose, place.seconds, place.motion, linked=place.linked, group=place.group)
+    return replace(there, anchor=place.anchor)
 
 
 class Track:
@@ -147,11 +173,19 @@ class Track:
         self.places: list[Place] = []
         self.prior = MotionPrior(config)
         self.open = np.zeros((3, 3))
-        """Covariance of what motion alone has told since a pose was seen."""
+        """Covariance of what motion alone has told since a pose was seen, along the axes of the map."""
         self.parked = False
         """Whether the robot may have been parked, and carried away, since then."""
         self.group = 0
         """Of the next place."""
+        self._coverage: dict[int, Coverage] = {}
+        """Of each group."""
+
+    def recall(self, place: Place) -> None:
+        """Take a place as it was taken before."""
+        self.places.append(place)
+        if place.keyframe is not None:
+            self._coverage.setdefault(place.group, Coverage()).add(place.keyframe.surfels, place.pose)
 
     def step(self, keyframe: Keyframe | None, motion: SE2 | None, seconds: float) -> Place:
         """Take the next keyframe; `seconds` since the one before, at which `motion` began."""
@@ -169,14 +203,14 @@ class Track:
         starts = [start]
         if seconds > PAUSE_S and motion is not None:  # a parked robot's odometry rests, and its errors with it
             starts += [before.pose @ motion.matrix, before.pose]
-        found = self._found(keyframe, starts, self.open + expected.covariance)
+        opened = grown(self.open, before.pose, start, expected.covariance)
+        found = self._found(keyframe, starts, opened)
         if found is None:
-            return self._go_on(keyframe, start, seconds, motion, expected)
+            return self._go_on(keyframe, start, seconds, motion, expected, opened)
         if held(found.hessian) < HELD_M**-2:  # along a corridor motion tells the way; across it the walls do
-            self.open = self.open + expected.covariance
+            self.open = opened
             return self._remember(keyframe, found.pose, seconds, motion, linked=False)
-        doubtful = self.parked or _lost(self.open + expected.covariance)
-        if keyframe and doubtful and not _seen_together(before, keyframe, found.pose):
+        if keyframe and (self.parked or _lost(opened)) and not self._seen_together(keyframe, found.pose):
             self.group += 1
         self.open, self.parked = np.zeros((3, 3)), False
         pose, hessian = found.pose, found.hessian
@@ -185,15 +219,37 @@ class Track:
             self.prior.see(seen, seconds)
             if motion is not None and seconds <= PAUSE_S:
                 self.prior.learn(motion, seconds, seen, _covariance_in_robot(hessian, before.pose))
+        if keyframe and found.sure and self._shown(keyframe, pose):
+            anchor = Anchor(found.nearest, between(self.places[found.nearest].pose, pose), hessian)
+            return self._leave_out(pose, seconds, motion, anchor)
         return self._remember(keyframe, pose, seconds, motion, linked=True)
 
+    def _shown(self, keyframe: Keyframe, pose: Matrix) -> bool:
+        """Whether keyframes of this group show all that this one does."""
+        coverage = self._coverage.get(self.group)
+        return coverage is not None and coverage.holds(keyframe.surfels, pose)
+
+    def _leave_out(self, pose: Matrix, seconds: float, motion: SE2 | None, anchor: Anchor) -> Place:
+        """Keep the pose alone."""
+        turn = np.kron(np.eye(2), self.places[anchor.index].pose[:3, :3])
+        tied = replace(anchor, hessian=turn.T @ anchor.hessian @ turn)
+        place = replace(placed(None, pose, seconds, motion, linked=True, group=self.group), anchor=tied)
+        self.recall(place)
+        return place
+
     def _go_on(
-        self, keyframe: Keyframe | None, start: Matrix, seconds: float, motion: SE2 | None, expected: Expected
+        self,
+        keyframe: Keyframe | None,
+        start: Matrix,
+        seconds: float,
+        motion: SE2 | None,
+        expected: Expected,
+        opened: Floats,
     ) -> Place:
         """Without a link to what is known: among keyframes that have none either, or as motion leads."""
         found = self._find(keyframe, [start], expected.covariance, linked=False)
         if found is None:
-            self.open = self.open + expected.covariance
+            self.open = opened
         self.parked |= seconds > PAUSE_S
         return self._remember(keyframe, start if found is None else found.pose, seconds, motion, linked=False)
 
@@ -201,7 +257,7 @@ class Track:
         self, keyframe: Keyframe | None, pose: Matrix, seconds: float, motion: SE2 | None, *, linked: bool
     ) -> Place:
         place = placed(keyframe, pose, seconds, motion, linked=linked, group=self.group)
-        self.places.append(place)
+        self.recall(place)
         return place
 
     def _found(self, keyframe: Keyframe | None, starts: Sequence[Matrix], covariance: Floats) -> Found | None:
@@ -210,7 +266,9 @@ class Track:
         if keyframe is None or (found and found.sure):
             return found
         wider = self._find(keyframe, starts, _WIDER * covariance, linked=True)
-        return wider if wider and (wider.sure or not found) else found
+        if wider is None or (found and not (wider.sure and wider.better_than(found))):
+            return found
+        return wider
 
     def _find(
         self, keyframe: Keyframe | None, starts: Sequence[Matrix], covariance: Floats, *, linked: bool
@@ -219,27 +277,34 @@ class Track:
         if keyframe is None:
             return None
         near = self._near(placed(keyframe, starts[0], 0.0, None, linked=False), linked=linked)
-        parts = [(place.keyframe, place.pose) for place in near if place.keyframe]
-        return Search(keyframe, parts, starts, covariance, self._config).result() if parts else None
+        known = {index: (place.keyframe, place.pose) for index, place in near.items() if place.keyframe}
+        if not known:
+            return None
+        found = Search(keyframe, list(known.values()), starts, covariance, self._config).result()
+        return replace(found, nearest=next(iter(known))) if found else None
 
-    def _near(self, place: Place, *, linked: bool) -> list[Place]:
+    def _near(self, place: Place, *, linked: bool) -> dict[int, Place]:
         """The last place and those that see most of the same, best first, of those that are linked or not."""
         shared = shared_voxels(self.places, place)
-        last = len(self.places) - 1
-        shared[last] = len(place.voxels) + 1
+        shared[self._last()] = len(place.voxels) + 1
         others = [index for index in shared if self.places[index].linked == linked]
         others.sort(key=lambda index: (-shared[index], index))
-        return [self.places[index] for index in others[: self._config.neighbours]]
+        return {index: self.places[index] for index in others[: self._config.neighbours]}
 
+    def _last(self) -> int:
+        """The last place, or the one it is tied to."""
+        anchor = self.places[-1].anchor
+        return anchor.index if anchor else len(self.places) - 1
 
-def _seen_together(before: Place, keyframe: Keyframe, pose: Matrix) -> bool:
-    """Whether a keyframe shows much of what the one before it did, whose place is known: then it is near, whatever
-    motion leaves open."""
-    if not before.linked or before.keyframe is None:
-        return False
-    seen = agreement(before.keyframe.sight, keyframe.sight, between(before.pose, pose))
-    samples = len(before.keyframe.sight.points) + len(keyframe.sight.points)
-    return seen.same_place(samples, sure=True) and seen.told > _TOGETHER * samples
+    def _seen_together(self, keyframe: Keyframe, pose: Matrix) -> bool:
+        """Whether a keyframe shows much of what the one before it did, whose place is known: then it is near, whatever
+        motion leaves open."""
+        before = self.places[self._last()]
+        if not before.linked or before.keyframe is None:
+            return False
+        seen = agreement(before.keyframe.sight, keyframe.sight, between(before.pose, pose))
+        samples = len(before.keyframe.sight.points) + len(keyframe.sight.points)
+        return seen.same_place(samples, sure=True) and seen.told > _TOGETHER * samples
 
 
 def _lost(covariance: Floats) -> bool:
@@ -266,6 +331,15 @@ class Found:
     """(6, 6) of the surfaces alone."""
     sure: bool
     """Whether pictures alone would do to tell."""
+    seen: Agreement
+    """With the pictures around it."""
+    nearest: int = 0
+    """The place that shows most of the same."""
+
+    def better_than(self, other: Found) -> bool:
+        """Whether what pictures tell, not how much, speaks for this pose: a wall that slides agrees with more of
+        itself."""
+        return not other.seen.alike or self.seen.mean < other.seen.mean - _CLEARLY
 
 
 class Search:
@@ -305,7 +379,7 @@ class Search:
         seen = self._agreement(pose)
         if len(fit) < _MIN_MATCHES or self._too_few(seen) or not seen.same_place(self._samples, sure=self._wide):
             return None
-        return Found(pose, fit.equations(pose[:3, 3])[0], seen.same_place(self._samples, sure=True))
+        return Found(pose, fit.equations(pose[:3, 3])[0], seen.same_place(self._samples, sure=True), seen)
 
     def _starts(self) -> list[Matrix]:
         """Headings that agree best, none beside another; and, since only what is nearly right already agrees well, some
@@ -390,8 +464,7 @@ class Search:
 
 def _voxels(points: Floats) -> NDArray[np.int64]:
     """Voxels in which points (N, 3) lie, numbered, rising."""
-    cells = np.floor(points / VOXEL_M).astype(np.int64) + (1 << 20)
-    return np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2])
+    return np.unique(voxel_numbers(points, VOXEL_M))
 
 
 def unlevel(pose: Matrix) -> Floats:
@@ -412,7 +485,8 @@ def _weakest(hessian: Floats) -> Floats:
 def _on_floor(hessian: Floats) -> tuple[Floats, Floats]:
     """Eigenvalues (2,), rising, and eigenvectors (2, 2) of what a Hessian (6, 6) tells of x and y alone."""
     keep, rest = [3, 4], [0, 1, 2, 5]
-    tied = hessian[np.ix_(keep, rest)] @ np.linalg.pinv(hessian[np.ix_(rest, rest)]) @ hessian[np.ix_(rest, keep)]
+    others = hessian[np.ix_(rest, rest)] + np.diag(np.full(4, _TINY * (1.0 + np.trace(hessian))))
+    tied = hessian[np.ix_(keep, rest)] @ np.linalg.solve(others, hessian[np.ix_(rest, keep)])
     values, vectors = np.linalg.eigh(hessian[np.ix_(keep, keep)] - tied)
     return np.asarray(values), np.asarray(vectors)
 
@@ -420,6 +494,4 @@ def _on_floor(hessian: Floats) -> tuple[Floats, Floats]:
 def _covariance_in_robot(hessian: Floats, before: Matrix) -> Floats:
     """(3, 3) of x, y and heading along the axes of the pose before."""
     whole = np.linalg.inv(hessian + np.diag([1e4, 1e4, 1e2, 1e1, 1e1, 1e4]))[np.ix_([3, 4, 2], [3, 4, 2])]
-    turn = np.eye(3)
-    turn[:2, :2] = before[:2, :2].T
-    return np.asarray(turn @ whole @ turn.T)
+    return along(np.asarray(whole), before.T)
