@@ -72,6 +72,7 @@ PAPER = [*GOOD, "--estimator", "paper"]
             "again",
         ),
         ([*GOOD, "--set", "export.free_threshold=0.9"], "leaves nothing between them", "0.196"),
+        ([*GOOD, "--set", "export.min_obstacle_height_m=2"], "nothing between them for obstacles", "1.5"),
         ([*GOOD, "--topic", "color=/camera"], "unknown role `color`", "did you mean `colour`?"),
         ([*GOOD, "--set", "extract.min_depth_m=7"], "leaves no depth between them", "max_depth_m"),
     ],

@@ -23,7 +23,7 @@ from semslam.stages.contract import FinishedShard
 from semslam.stages.settings import ExportConfig
 from semslam.tables.parquet import TableFiles, write_table
 from semslam.tables.pictures import encode_colour, encode_depth
-from semslam.tables.spec import CELLS, DETECTIONS, FRAMES, OBJECTS, POSES, TRAJECTORY
+from semslam.tables.spec import CELLS, DETECTIONS, FRAMES, LAYERS, OBJECTS, POSES, TRAJECTORY
 from tests.slam_world import MemoryContext
 
 CLASSES = class_list(("chair",))
@@ -112,9 +112,10 @@ def test_all_files_are_there(tmp_path: Path) -> None:
     """Exactly these."""
     context = exported(tmp_path, POSE_LIST, CELL_LIST)
     assert sorted(path.name for path in (context.folder / "shard-0").iterdir()) == [
-        "map.parquet", "map.pgm", "map.png", "map.yaml", "objects.parquet", "trajectory.parquet", "trajectory.tum",
+        "layers.parquet", "layers.png", "map.parquet", "map.pgm", "map.png", "map.yaml", "objects.parquet",
+        "trajectory.parquet", "trajectory.tum",
     ]  # fmt: skip
-    assert context.done[-1] == (6, 6)
+    assert context.done[-1] == (9, 9)
     assert context.shards[0].warnings == []
 
 
@@ -134,16 +135,47 @@ def test_trajectory_leaves_out_keyframes_without_a_pose(tmp_path: Path) -> None:
 
 
 def test_map_server_files(tmp_path: Path) -> None:
-    """First row on top, lower left corner as origin, three grey values that map_server tells apart."""
-    shard = exported(tmp_path, POSE_LIST, CELL_LIST).folder / "shard-0"
+    """From depth, not from the semantic cells: a board, free floor before it, and what neither hides nor shows."""
+    context = exported(tmp_path, POSE_LIST[:1], CELL_LIST)
+    shard = context.folder / "shard-0"
     yaml = dict(line.split(": ", 1) for line in (shard / "map.yaml").read_text().splitlines())
+    origin = [float(word) for word in yaml.pop("origin").strip("[]").split(",")]
     assert yaml == {
-        "image": "map.pgm", "mode": "trinary", "resolution": "0.100000", "origin": "[-0.300000, -0.200000, 0.0]",
-        "negate": "0", "occupied_thresh": "0.65", "free_thresh": "0.196",
+        "image": "map.pgm", "mode": "trinary", "resolution": "0.050000", "negate": "0", "occupied_thresh": "0.65",
+        "free_thresh": "0.196",
     }  # fmt: skip
     image = cv2.imread(str(shard / "map.pgm"), cv2.IMREAD_UNCHANGED)
     assert image is not None
-    assert image.tolist() == [[205, 205, 205, 0], [205, 205, 205, 205], [205, 205, 205, 205], [254, 0, 205, 205]]
+    assert set(np.unique(image)) == {0, 205, 254}
+
+    def grey(x_m: float, y_m: float) -> int:
+        column, row = (int((place - corner) / 0.05) for place, corner in zip((x_m, y_m), origin[:2], strict=True))
+        return int(image[image.shape[0] - 1 - row, column])
+
+    assert (grey(2.02, 0.02), grey(2.02, -0.2)) == (0, 0)
+    assert {grey(1.6, y_m) for y_m in (-0.2, 0.02, 0.2)} == {254}
+    assert grey(2.4, 0.02) == 205
+
+
+def test_layers_lie_on_the_map_at_the_poses(tmp_path: Path) -> None:
+    """Rows by row and column, heights of the board, null where nothing is known; metadata as it should be."""
+    poses = [(1.0, 2.0, math.pi / 2), None]
+    config = ExportConfig(layer_cell_m=0.1, max_obstacle_height_m=1.0)
+    table = exported(tmp_path, poses, CELL_LIST, config).results(LAYERS)["layers"]
+    rows = table.read()
+    assert table.meta == {
+        "cell_m": 0.1, "min_obstacle_height_m": 0.1, "max_obstacle_height_m": 1.0, "estimator": "paper",
+    }  # fmt: skip
+    assert list(zip(rows["iy"], rows["ix"], strict=True)) == sorted(zip(rows["iy"], rows["ix"], strict=True))
+    assert rows["x_m"] == pytest.approx([(ix + 0.5) * 0.1 for ix in rows["ix"]])
+    board = list(zip(rows["ix"], rows["iy"], strict=True)).index((9, 40))
+    assert rows["occupancy"][board] == pytest.approx(0.88, abs=0.01)
+    assert rows["top_m"][board] == pytest.approx(0.72, abs=0.04)
+    assert (rows["floor_m"][board], rows["views"][board]) == (None, 1)
+    assert rows["points"][board] > 10
+    before = list(zip(rows["ix"], rows["iy"], strict=True)).index((9, 36))
+    assert rows["occupancy"][before] == pytest.approx(0.18, abs=0.01)
+    assert rows["top_m"][before] is None
 
 
 @pytest.mark.parametrize(("free", "occupied"), [(0.196, 0.65), (0.25, 0.65), (0.1, 0.15), (0.004, 0.999), (0.5, 0.9)])
@@ -186,13 +218,22 @@ def test_an_empty_map_and_no_poses(tmp_path: Path) -> None:
 
 
 def test_a_torn_map_warns_instead_of_filling_the_disk(tmp_path: Path) -> None:
-    """Two cells a thousand kilometres apart: no PGM, but a picture, and a word about it."""
-    context = exported(tmp_path, POSE_LIST, {(0, 0): OBSTACLE, (10_000_000, 10_000_000): OBSTACLE})
+    """Two keyframes a thousand kilometres apart: no PGM, but pictures, and a word about it."""
+    torn: list[tuple[float, float, float] | None] = [(0.0, 0.0, 0.0), (1e6, 1e6, 0.0)]
+    context = exported(tmp_path, torn, {(0, 0): OBSTACLE, (10_000_000, 10_000_000): OBSTACLE})
     names = {path.name for path in (context.folder / "shard-0").iterdir()}
     assert "map.pgm" not in names
     assert "map.yaml" not in names
-    assert "map.png" in names
+    assert {"map.png", "layers.png"} < names
     assert "map.pgm" in context.shards[0].warnings[0]
+
+
+def test_a_pose_off_any_map_is_left_out_of_the_layers(tmp_path: Path) -> None:
+    """The others make the same table as without it."""
+    far: list[tuple[float, float, float] | None] = [(0.0, 0.0, 0.0), (1e12, 0.0, 0.0)]
+    near: list[tuple[float, float, float] | None] = [(0.0, 0.0, 0.0), None]
+    first, second = (exported(tmp_path / name, poses, {}) for name, poses in (("far", far), ("near", near)))
+    assert first.results(LAYERS)["layers"].read() == second.results(LAYERS)["layers"].read()
 
 
 def test_same_tables_same_bytes(tmp_path: Path) -> None:

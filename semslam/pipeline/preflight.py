@@ -112,10 +112,13 @@ def _check_localize(config: Config) -> None:
 
 
 def _check_export(config: Config) -> None:
+    from semslam.slam.depth_sight import Columns
     from semslam.slam.exchange import unknown_grey
 
     section = config.of(EXPORT)
     unknown_grey(section.free_threshold, section.occupied_threshold)
+    low_m, high_m = section.min_obstacle_height_m, section.max_obstacle_height_m
+    Columns(section.layer_cell_m, low_m, high_m, section.layer_depth_m)
 
 
 _CHECKS: dict[str, Callable[[Config], None]] = {

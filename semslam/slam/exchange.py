@@ -9,29 +9,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semslam.errors import SemslamError
-from semslam.labels import FREE_FLOOR
-from semslam.slam.picture import MapCells
+from semslam.slam.layers import LayerCells
 
 MAX_PIXELS = 1 << 26
 """Largest PGM that is written, in cells."""
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 
 
-def occupancy_image(cells: MapCells, unknown: int) -> tuple[NDArray[np.uint8], tuple[float, float]] | None:
+def occupancy_image(
+    cells: LayerCells, free: float, occupied: float, unknown: int
+) -> tuple[NDArray[np.uint8], tuple[float, float]] | None:
     """Grey values of the map's bounding box, first row on top, and the map frame position of its lower left corner.
 
-    Objects and obstacles are occupied. None if the box has more than `MAX_PIXELS` cells; an empty map is one unknown
-    cell, because map_server refuses pictures without pixels.
+    Cells whose occupancy is above `occupied` are occupied, those below `free` free; the others are unknown. None if the
+    box has more than `MAX_PIXELS` cells; an empty map is one unknown cell, because map_server refuses pictures without
+    pixels.
     """
-    if not cells.ix.size:
+    known = ~np.isnan(cells.occupancy)
+    ix, iy, occupancy = cells.ix[known], cells.iy[known], cells.occupancy[known]
+    if not ix.size:
         return np.full((1, 1), unknown, np.uint8), (0.0, 0.0)
-    left, low = int(cells.ix.min()), int(cells.iy.min())
-    columns, rows = int(cells.ix.max()) - left + 1, int(cells.iy.max()) - low + 1
+    left, low = int(ix.min()), int(iy.min())
+    columns, rows = int(ix.max()) - left + 1, int(iy.max()) - low + 1
     if columns * rows > MAX_PIXELS:
         return None
     image = np.full((rows, columns), unknown, np.uint8)
-    image[cells.iy - low, cells.ix - left] = np.where(cells.class_id == FREE_FLOOR, _FREE, _OCCUPIED)
-    return np.ascontiguousarray(image[::-1]), (left * cells.cell_m, low * cells.cell_m)
+    image[iy - low, ix - left] = np.where(occupancy > occupied, _OCCUPIED, np.where(occupancy < free, _FREE, unknown))
+    cell_m = cells.columns.cell_m
+    return np.ascontiguousarray(image[::-1]), (left * cell_m, low * cell_m)
 
 
 def unknown_grey(free_threshold: float, occupied_threshold: float) -> int:

@@ -50,6 +50,10 @@ class View:
     cell_m: float
     scale: float
     """Pixels a cell: a whole number, or less than 1."""
+    x: int = LEFT
+    """Where the panel begins on the picture, pixels from the left, ..."""
+    y: int = TOP
+    """... and from the top."""
 
     @property
     def width(self) -> int:
@@ -68,31 +72,43 @@ class View:
 
     def pixels(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Map frame (N, 2) to picture (N, 2)."""
-        x = LEFT + (points_m[:, 0] / self.cell_m - self.left) * self.scale
-        y = TOP + self.height - (points_m[:, 1] / self.cell_m - self.low) * self.scale
+        x = self.x + (points_m[:, 0] / self.cell_m - self.left) * self.scale
+        y = self.y + self.height - (points_m[:, 1] / self.cell_m - self.low) * self.scale
         return np.stack([x, y], 1) - 0.5
 
 
 def fit_view(cells: MapCells, path: Path, pixels_per_cell: int) -> View:
     """The smallest window about cells and path, enlarged to the least size of the panel."""
-    low, high = _bounds(cells, path)
+    corners = np.stack([cells.ix, cells.iy], 1)
+    return fit_cells(corners, cells.cell_m, path, pixels_per_cell, _LARGEST, _LEAST)
+
+
+def fit_cells(
+    corners: NDArray[np.int64],
+    cell_m: float,
+    path: Path,
+    pixels_per_cell: int,
+    largest: tuple[int, int],
+    least: tuple[int, int],
+) -> View:
+    """The smallest window about cells (N, 2) and path on a panel of those sizes, width and height in pixels."""
+    low, high = _bounds(corners.astype(np.float64), cell_m, path)
     extent = high - low
-    fitting = float(min(_LARGEST / extent))
+    fitting = float(min(largest / extent))
     scale = float(min(math.floor(fitting), _COARSEST)) if fitting >= 1.0 else fitting
     if pixels_per_cell and pixels_per_cell * extent.max() <= _MAX_PIXELS:
         scale = float(pixels_per_cell)
-    wanted = np.maximum(extent, np.ceil(np.array(_LEAST) / scale))
+    wanted = np.maximum(extent, np.ceil(np.array(least) / scale))
     left, bottom = (int(v) for v in low - (wanted - extent) // 2)
-    return View(left, bottom, int(wanted[0]), int(wanted[1]), cells.cell_m, scale)
+    return View(left, bottom, int(wanted[0]), int(wanted[1]), cell_m, scale)
 
 
-def _bounds(cells: MapCells, path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _bounds(corners: NDArray[np.float64], cell_m: float, path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """First and last (exclusive) column and row, with a margin, of everything there is to show."""
-    corners = np.stack([cells.ix, cells.iy], 1).astype(np.float64)
-    every = np.concatenate([corners, corners + 1, path.posed / cells.cell_m])
+    every = np.concatenate([corners, corners + 1, path.posed / cell_m])
     if not len(every):
         every = np.zeros((1, 2))
-    margin = _MARGIN_M / cells.cell_m
+    margin = _MARGIN_M / cell_m
     return np.floor(every.min(0) - margin), np.ceil(every.max(0) + margin)
 
 
@@ -100,15 +116,15 @@ def draw_panel(canvas: Canvas, view: View, cells: MapCells, path: Path, colours:
     """Everything inside the axes, and the axes."""
     raster = _rasterize(cells, view)
     _paint_cells(canvas, raster, cells.classes, colours, view)
-    _draw_axes(canvas, view)
-    taken = _draw_path(canvas, path, view)
+    draw_axes(canvas, view)
+    taken = draw_path(canvas, path, view)
     _draw_labels(canvas, raster, cells.classes, view, taken)
     if not cells.ix.size:
-        middle = LEFT + view.width / 2, TOP + view.height / 2
+        middle = view.x + view.width / 2, view.y + view.height / 2
         canvas.text(*middle, "No cells were mapped", 22, weight=MEDIUM, align=0.5, halo=palette.UNKNOWN)
         note = "No keyframe with a pose saw floor, obstacles or objects."
         canvas.text(middle[0], middle[1] + 28, note, 15, colour=SOFT_INK, align=0.5, halo=palette.UNKNOWN)
-    _draw_scale(canvas, view)
+    draw_scale(canvas, view)
 
 
 def _rasterize(cells: MapCells, view: View) -> _Raster:
@@ -133,10 +149,10 @@ def _paint_cells(
     canvas: Canvas, raster: _Raster, classes: tuple[str, ...], colours: Mapping[str, Colour], view: View
 ) -> None:
     """Flat colours; a metre grid over the background; objects on top with a dark outline."""
-    panel = canvas.image[TOP : TOP + view.height, LEFT : LEFT + view.width]
+    panel = canvas.image[view.y : view.y + view.height, view.x : view.x + view.width]
     panel[...] = palette.UNKNOWN
     panel[raster == FREE_FLOOR] = palette.FREE
-    _paint_grid(panel, view)
+    paint_grid(panel, view)
     panel[raster == OBSTACLE] = palette.OBSTACLE
     for class_id in np.unique(raster[raster >= FIRST_OBJECT]):
         mask = (raster == class_id).astype(np.uint8)
@@ -147,7 +163,7 @@ def _paint_cells(
             panel[(mask > 0) & (inner == 0)] = darker(colour)
 
 
-def _paint_grid(panel: NDArray[np.uint8], view: View) -> None:
+def paint_grid(panel: NDArray[np.uint8], view: View) -> None:
     """Darken the lines at whole ticks a little."""
     for _, x in _ticks(view.left * view.cell_m, view.width, view.pixels_per_m):
         panel[:, x] = (panel[:, x] * 0.93).astype(np.uint8)
@@ -170,24 +186,30 @@ def _round_step(least: float) -> float:
     return next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= least * (1 - 1e-9))
 
 
-def _draw_axes(canvas: Canvas, view: View) -> None:
-    right, bottom = LEFT + view.width, TOP + view.height
-    frame = [[LEFT - 1, TOP - 1], [right, TOP - 1], [right, bottom], [LEFT - 1, bottom], [LEFT - 1, TOP - 1]]
+def draw_axes(canvas: Canvas, view: View) -> None:
+    right, bottom = view.x + view.width, view.y + view.height
+    frame = [
+        [view.x - 1, view.y - 1],
+        [right, view.y - 1],
+        [right, bottom],
+        [view.x - 1, bottom],
+        [view.x - 1, view.y - 1],
+    ]
     canvas.line(frame, SOFT_INK)
     for metres, pixel in _ticks(view.left * view.cell_m, view.width, view.pixels_per_m):
-        canvas.line([[LEFT + pixel, bottom], [LEFT + pixel, bottom + 5]], SOFT_INK)
-        canvas.text(LEFT + pixel, bottom + 20, _number(metres), 13, colour=SOFT_INK, align=0.5)
+        canvas.line([[view.x + pixel, bottom], [view.x + pixel, bottom + 5]], SOFT_INK)
+        canvas.text(view.x + pixel, bottom + 20, _number(metres), 13, colour=SOFT_INK, align=0.5)
     for metres, pixel in _ticks(view.low * view.cell_m, view.height, view.pixels_per_m):
-        canvas.line([[LEFT - 6, bottom - 1 - pixel], [LEFT - 1, bottom - 1 - pixel]], SOFT_INK)
-        canvas.text(LEFT - 11, bottom + 4 - pixel, _number(metres), 13, colour=SOFT_INK, align=1.0)
-    canvas.text(LEFT, bottom + 48, "metres; x ahead of the start, y to its left", 13, colour=SOFT_INK)
+        canvas.line([[view.x - 6, bottom - 1 - pixel], [view.x - 1, bottom - 1 - pixel]], SOFT_INK)
+        canvas.text(view.x - 11, bottom + 4 - pixel, _number(metres), 13, colour=SOFT_INK, align=1.0)
+    canvas.text(view.x, bottom + 48, "metres; x ahead of the start, y to its left", 13, colour=SOFT_INK)
 
 
 def _number(metres: float) -> str:
     return f"{metres + 0.0:g}".replace("-", "−")
 
 
-def _draw_path(canvas: Canvas, path: Path, view: View) -> list[tuple[float, float, float, float]]:
+def draw_path(canvas: Canvas, path: Path, view: View) -> list[tuple[float, float, float, float]]:
     """The path with direction arrows, start and end; gives the boxes (x0, y0, x1, y1) that labels should avoid."""
     points = view.pixels(path.posed)
     if not len(points):
@@ -250,11 +272,11 @@ def _draw_labels(
     for class_id, x, top, middle, bottom in _blobs(raster, view)[:_MAX_LABELS]:
         name = classes[class_id]
         half = canvas.text_width(name, 14, MEDIUM) / 2 + 3
-        x = min(max(x, LEFT + half + 2), LEFT + view.width - half - 2)
+        x = min(max(x, view.x + half + 2), view.x + view.width - half - 2)
         beside = (top - 6, bottom + 17)
         for baseline in (middle + 5, *beside) if bottom - top >= _LABEL_INSIDE else (*beside, middle + 5):
             box = (x - half, baseline - 14, x + half, baseline + 5)
-            inside = box[1] >= TOP and box[3] <= TOP + view.height
+            inside = box[1] >= view.y and box[3] <= view.y + view.height
             if inside and not any(_overlap(box, other) for other in boxes):
                 canvas.text(x, baseline, name, 14, weight=MEDIUM, colour=INK, align=0.5, halo=PAGE)
                 boxes.append(box)
@@ -268,7 +290,7 @@ def _blobs(raster: _Raster, view: View) -> list[tuple[int, float, float, float, 
         _, _, stats, centres = cv2.connectedComponentsWithStats((raster == class_id).astype(np.uint8), connectivity=8)
         for (_, top, _, height, area), (x, middle) in zip(stats[1:].tolist(), centres[1:].tolist(), strict=True):
             if area / view.pixels_per_m**2 >= _LABEL_M2:
-                found.append((-area, int(class_id), LEFT + x, TOP + top, TOP + middle, TOP + top + height))
+                found.append((-area, int(class_id), view.x + x, view.y + top, view.y + middle, view.y + top + height))
     return [blob[1:] for blob in sorted(found)]
 
 
@@ -276,10 +298,10 @@ def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float,
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def _draw_scale(canvas: Canvas, view: View) -> None:
+def draw_scale(canvas: Canvas, view: View) -> None:
     """A bar of a round length below the panel, at the right."""
     length_m = _round_step(90.0 / view.pixels_per_m)
-    right, y = float(LEFT + view.width), TOP + view.height + 46.0
+    right, y = float(view.x + view.width), view.y + view.height + 46.0
     left = right - length_m * view.pixels_per_m
     canvas.line([[left, y], [right, y]], INK, 3)
     for x in (left, right):

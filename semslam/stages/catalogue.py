@@ -11,6 +11,7 @@ from semslam.tables.spec import (
     CELLS,
     DETECTIONS,
     FRAMES,
+    LAYERS,
     MOTION,
     OBJECTS,
     OBSERVATIONS,
@@ -55,10 +56,10 @@ LOCALIZE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=2,
+    version=3,
     config=ExportConfig,
     reads=(POSES, CELLS, PLACES, FRAMES, DETECTIONS),
-    writes=(TRAJECTORY, OBJECTS),
+    writes=(TRAJECTORY, OBJECTS, LAYERS),
     entry="semslam.stages.export:run",
     unit="file",
     libraries=("numpy", "opencv-contrib-python-headless", "pyarrow"),

@@ -3,13 +3,16 @@
 Reads   poses          data_spec.md, table 7
         cells          data_spec.md, table 9
         places         data_spec.md, table 16, of estimators that have one
-        frames         data_spec.md, table 2: depth, for the objects
+        frames         data_spec.md, table 2: depth, for the layers and the objects
         detections     data_spec.md, table 5
 Writes  trajectory     data_spec.md, table 10: keyframes with a pose
         objects        data_spec.md, table 17: the things of the map
+        layers         data_spec.md, table 18: occupancy and heights, from depth alone
 Files   map.png        the picture
         map.parquet    the cells table again, as a file that stands alone
-        map.yaml, map.pgm   ROS map_server; left out, with a warning, for maps too large for a picture of single cells
+        layers.png     occupancy and heights as a picture
+        map.yaml, map.pgm   the occupancy for ROS map_server; left out, with a warning, for maps too large for a
+                            picture of single cells
         trajectory.tum      seconds x y z qx qy qz qw
         places.parquet      the places table again, if there is one: a map in which other logs can be found
 """
@@ -21,12 +24,16 @@ from itertools import groupby
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semslam.geometry import rle
 from semslam.geometry.frames import SE2
 from semslam.geometry.projection import flying, main_body, points_in_robot
+from semslam.slam.depth_sight import Columns, DepthImage
 from semslam.slam.evidence import LARGEST_M
 from semslam.slam.exchange import MAX_PIXELS, map_yaml, occupancy_image, pgm, tum, unknown_grey
+from semslam.slam.layer_picture import render_layers
+from semslam.slam.layers import LayerCells, Layers
 from semslam.slam.objects import Patch, things
 from semslam.slam.picture import MapCells, Path
 from semslam.slam.render import render_map
@@ -34,12 +41,13 @@ from semslam.stages.contract import ShardWriter, StageContext, TableSource
 from semslam.stages.settings import ExportConfig
 from semslam.tables.parquet import TableFileWriter, write_table
 from semslam.tables.pictures import decode_depth
-from semslam.tables.spec import CELLS, DETECTIONS, FRAMES, OBJECTS, PLACES, POSES, TRAJECTORY
+from semslam.tables.spec import CELLS, DETECTIONS, FRAMES, LAYERS, OBJECTS, PLACES, POSES, TRAJECTORY
 
 _POSE = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad", "verdict")
-_FILES = 6
+_PICTURE = ["frame", "depth", "fx", "fy", "cx", "cy", "robot_from_camera"]
+_FILES = 9
 
-Columns = Mapping[str, list[Any]]
+_Table = Mapping[str, list[Any]]
 
 
 def run(ctx: StageContext) -> None:
@@ -49,21 +57,35 @@ def run(ctx: StageContext) -> None:
     config: ExportConfig = ctx.config
     poses, cells = ctx.read(POSES), ctx.read(CELLS)
     track, rows = poses.read(_POSE), cells.read()
-    shown = _map_cells(rows, cells.meta)
+    shown, placed = _map_cells(rows, cells.meta), _placed(track)
+    path = Path(*(np.array(track[name], np.float64) for name in ("x_m", "y_m")))
     with ctx.shard(0) as shard:
         _write_trajectory(shard, track, poses)
-        ctx.progress(1, _FILES)
         write_table(shard.path("map.parquet"), CELLS, rows, dict(cells.meta))
-        ctx.progress(2, _FILES)
-        _write_occupancy(shard, shown, config)
-        ctx.progress(4, _FILES)
-        path = Path(*(np.array(track[name], np.float64) for name in ("x_m", "y_m")))
         subtitle = _subtitle(str(cells.meta["estimator"]), path, shown)
         shard.path("map.png").write_bytes(render_map(shown, path, ctx.log, subtitle, config.pixels_per_cell))
+        ctx.progress(3, _FILES)
+        layers = _layers(ctx, placed, config)
+        _write_layers(shard, layers, cells.meta)
+        ctx.progress(4, _FILES)
+        _write_occupancy(shard, layers, config)
+        ctx.progress(6, _FILES)
+        subtitle = _layers_subtitle(str(cells.meta["estimator"]), path, layers)
+        thresholds = config.free_threshold, config.occupied_threshold
+        shard.path("layers.png").write_bytes(render_layers(layers, path, ctx.log, subtitle, thresholds))
         _write_places(ctx, shard)
-        ctx.progress(5, _FILES)
-        _write_objects(ctx, shard, track, dict(cells.meta), config)
+        ctx.progress(8, _FILES)
+        _write_objects(ctx, shard, placed, dict(cells.meta), config)
         ctx.progress(_FILES, _FILES)
+
+
+def _placed(track: _Table) -> dict[int, SE2]:
+    """Poses of the keyframes that have one which is on the map."""
+    return {
+        frame: SE2(x, y, heading)
+        for frame, x, y, heading in zip(*(track[name] for name in ("frame", "x_m", "y_m", "heading_rad")), strict=True)
+        if x is not None and max(abs(x), abs(y)) < LARGEST_M
+    }
 
 
 def _write_places(ctx: StageContext, shard: ShardWriter) -> None:
@@ -83,14 +105,9 @@ def _write_places(ctx: StageContext, shard: ShardWriter) -> None:
 
 
 def _write_objects(
-    ctx: StageContext, shard: ShardWriter, track: Columns, meta: Mapping[str, Any], config: ExportConfig
+    ctx: StageContext, shard: ShardWriter, poses: Mapping[int, SE2], meta: Mapping[str, Any], config: ExportConfig
 ) -> None:
     """The objects that the detections show at the poses."""
-    poses = {
-        frame: SE2(x, y, heading)
-        for frame, x, y, heading in zip(*(track[name] for name in ("frame", "x_m", "y_m", "heading_rad")), strict=True)
-        if x is not None and max(abs(x), abs(y)) < LARGEST_M
-    }
     patches = _patches(ctx.read(FRAMES), ctx.read(DETECTIONS), poses, config.object_depth_m)
     found = things(patches, config.object_frames)
     classes = meta["classes"]
@@ -117,7 +134,7 @@ def _patches(
     frames: TableSource, detections: TableSource, poses: Mapping[int, SE2], max_depth_m: float
 ) -> Iterator[Patch]:
     """What each detection of keyframes with a pose covers of the ground."""
-    pictures = _rows(frames, ["frame", "depth", "fx", "fy", "cx", "cy", "robot_from_camera"])
+    pictures = _rows(frames, _PICTURE)
     columns = ["frame", "stamp_nanos", "class_id", "score", "mask_runs", "depth_pixels"]
     for frame, group in groupby(_rows(detections, columns), key=lambda row: row["frame"]):
         picture = next((row for row in pictures if row["frame"] == frame), None)
@@ -150,12 +167,12 @@ def _rows(table: TableSource, columns: list[str]) -> Iterator[dict[str, Any]]:
             yield dict(zip(batch, values, strict=True))
 
 
-def _map_cells(rows: Columns, meta: Mapping[str, Any]) -> MapCells:
+def _map_cells(rows: _Table, meta: Mapping[str, Any]) -> MapCells:
     ix, iy, class_id = (np.array(rows[name], np.int64) for name in ("ix", "iy", "class_id"))
     return MapCells(ix, iy, class_id, tuple(meta["classes"]), float(meta["cell_m"]))
 
 
-def _write_trajectory(shard: ShardWriter, track: Columns, poses: TableSource) -> None:
+def _write_trajectory(shard: ShardWriter, track: _Table, poses: TableSource) -> None:
     """The keyframes with a pose, as table and as TUM file."""
     kept = [i for i, x in enumerate(track["x_m"]) if x is not None]
     posed = {name: [track[name][i] for i in kept] for name in _POSE}
@@ -164,10 +181,48 @@ def _write_trajectory(shard: ShardWriter, track: Columns, poses: TableSource) ->
     shard.path("trajectory.tum").write_text(lines, encoding="ascii", newline="\n")
 
 
-def _write_occupancy(shard: ShardWriter, cells: MapCells, config: ExportConfig) -> None:
+def _layers(ctx: StageContext, poses: Mapping[int, SE2], config: ExportConfig) -> LayerCells:
+    """Occupancy and heights from the depth of all keyframes with a pose."""
+    low_m, high_m = config.min_obstacle_height_m, config.max_obstacle_height_m
+    layers = Layers(Columns(config.layer_cell_m, low_m, high_m, config.layer_depth_m))
+    for picture in _rows(ctx.read(FRAMES), _PICTURE):
+        if picture["frame"] in poses:
+            fx, fy, cx, cy = (picture[name] for name in ("fx", "fy", "cx", "cy"))
+            robot_from_camera = np.array(picture["robot_from_camera"], np.float64).reshape(4, 4)
+            image = DepthImage(decode_depth(picture["depth"]), fx, fy, cx, cy, robot_from_camera)
+            layers.add(image, poses[picture["frame"]])
+    return layers.cells()
+
+
+def _write_layers(shard: ShardWriter, cells: LayerCells, meta: Mapping[str, Any]) -> None:
+    columns = cells.columns
+    rows = {
+        "ix": cells.ix.tolist(),
+        "iy": cells.iy.tolist(),
+        "x_m": ((cells.ix + 0.5) * columns.cell_m).tolist(),
+        "y_m": ((cells.iy + 0.5) * columns.cell_m).tolist(),
+        **{name: _nullable(getattr(cells, name)) for name in ("occupancy", "floor_m", "top_m")},
+        "points": cells.points.tolist(),
+        "views": cells.views.tolist(),
+    }
+    about = {
+        "cell_m": columns.cell_m,
+        "min_obstacle_height_m": columns.low_m,
+        "max_obstacle_height_m": columns.high_m,
+        "estimator": meta["estimator"],
+    }
+    shard.table(LAYERS, about).append(rows)
+
+
+def _nullable(values: NDArray[np.float64]) -> list[float | None]:
+    """Values with None for NaN."""
+    return [None if value != value else value for value in values.tolist()]
+
+
+def _write_occupancy(shard: ShardWriter, cells: LayerCells, config: ExportConfig) -> None:
     """map.pgm and map.yaml."""
     occupied, free = config.occupied_threshold, config.free_threshold
-    found = occupancy_image(cells, unknown_grey(free, occupied))
+    found = occupancy_image(cells, free, occupied, unknown_grey(free, occupied))
     if found is None:
         shard.warn(
             f"The map spans more than {MAX_PIXELS:,} cells; `map.pgm` and `map.yaml` were left out. "
@@ -176,8 +231,19 @@ def _write_occupancy(shard: ShardWriter, cells: MapCells, config: ExportConfig) 
         return
     image, corner = found
     shard.path("map.pgm").write_bytes(pgm(image))
-    text = map_yaml("map.pgm", cells.cell_m, corner, occupied, free)
+    text = map_yaml("map.pgm", config.layer_cell_m, corner, occupied, free)
     shard.path("map.yaml").write_text(text, encoding="ascii", newline="\n")
+
+
+def _layers_subtitle(estimator: str, path: Path, cells: LayerCells) -> str:
+    columns = cells.columns
+    words = [
+        f"estimator {estimator}",
+        f"depth of {len(path.posed):,} keyframes",
+        f"cell {columns.cell_m:g} m",
+        f"obstacles from {columns.low_m:g} to {columns.high_m:g} m",
+    ]
+    return "  ·  ".join(words)
 
 
 def _subtitle(estimator: str, path: Path, cells: MapCells) -> str:

@@ -277,10 +277,19 @@ class ExportConfig:
 
     pixels_per_cell: int = setting(0, low=0, high=200)
     """Pixels of the map picture a cell; 0 chooses a picture of about 1000 pixels."""
+    layer_cell_m: float = setting(0.05, low=0.02, high=10.0)
+    """Cell of the occupancy and height layers and of the map_server file, metres."""
+    layer_depth_m: float = setting(6.0, low=0.5, high=20.0)
+    """Farther depth is ignored in the layers, metres."""
+    min_obstacle_height_m: float = setting(0.1, low=0.0, high=10.0)
+    """What is lower is floor to the robot, metres."""
+    max_obstacle_height_m: float = setting(1.5, low=0.1, high=10.0)
+    """What is higher is above the robot, metres."""
     occupied_threshold: float = setting(0.65, low=0.0, high=1.0)
-    """occupied_thresh of the map_server file."""
+    """occupied_thresh of the map_server file: cells more probably occupied than this are written as occupied."""
     free_threshold: float = setting(0.196, low=0.0, high=1.0)
-    """free_thresh of the map_server file; 0.196 is what it reads for the grey of unknown cells."""
+    """free_thresh of the map_server file: cells less probably occupied than this are written as free. 0.196 is what it
+    reads for the grey of unknown cells."""
     object_frames: int = setting(2, low=1, high=100000)
     """Keyframes that must have seen an object of the objects table."""
     object_depth_m: float = setting(6.0, low=0.5, high=1000.0)

@@ -446,7 +446,30 @@ OBJECTS = Table(
     ),
 )
 
+LAYERS = Table(
+    "layers",
+    18,
+    "export",
+    (
+        _c("ix", "int32", "", "cell column; the cell covers [ix, ix + 1) * cell_m along x of the map frame"),
+        _c("iy", "int32", "", "cell row, likewise along y"),
+        _c("x_m", "float64", "m", "cell centre in the map frame"),
+        _c("y_m", "float64", "m", "cell centre in the map frame"),
+        _c(
+            "occupancy",
+            "float32",
+            "",
+            "probability that an obstacle stands above the cell; null if too little was seen",
+            null=True,
+        ),
+        _c("floor_m", "float32", "m", "height of the floor, median; null if none was seen", null=True),
+        _c("top_m", "float32", "m", "top of the highest obstacle; null if there is none", null=True),
+        _c("points", "uint32", "", "depth pixels that fell into the cell, of those looked at"),
+        _c("views", "uint32", "", "keyframes that saw something of the column above the cell"),
+    ),
+)
+
 ALL_TABLES: tuple[Table, ...] = (
     TOPICS, FRAMES, MOTION, TRUTH, DETECTIONS, OBSERVATIONS, POSES, SNAPSHOTS, CELLS, TRAJECTORY, EVALUATION,
-    SPLITS, TRUE_MAP, HOME_OBJECTS, VIEWS, PLACES, OBJECTS,
+    SPLITS, TRUE_MAP, HOME_OBJECTS, VIEWS, PLACES, OBJECTS, LAYERS,
 )  # fmt: skip

@@ -1,0 +1,165 @@
+"""Occupancy and heights of a map from the depth of its keyframes: a column of slices above each cell.
+
+Each slice holds the log-odds of being occupied: what hits it adds `HIT`, what sees through it (depth_sight.py) adds
+`PASS`, within bounds, so that somebody who stood there is forgotten once he has gone. They are whole numbers of
+1 / `STEPS`, so that sums are exact. A cell is as occupied as the most occupied of its slices. It is free only if all
+its slices, from the lowest to the highest about which anything is known, were seen through: rays that pass high above
+a bed say nothing of the bed, nor does floor that was seen beneath it.
+
+Heights are counted in bins, once a keyframe. The floor is the median of what is below the obstacles, the top the 90th
+percentile within the highest occupied slice: neither hangs on a single pixel.
+
+Memory grows with the mapped area, in tiles of 64 x 64 cells, not with time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semslam.geometry.frames import SE2
+from semslam.slam.depth_sight import BIN_M, BINS, SLICE_M, Columns, DepthImage, Sight, look
+from semslam.slam.evidence import LARGEST_CELL, LARGEST_M
+
+TILE = 64
+STEPS = 16
+HIT, PASS = 32, -24
+"""Two natural units (probability 0.88) and one and a half (0.18)."""
+LEAST, MOST = -64, 96
+FREE_SHARE = 0.5
+"""Share of the slices, from the lowest on, that must have been seen through in a free cell."""
+TOP, FLOOR = 0.9, 0.5
+"""Shares of the heights that lie below what is told."""
+
+_Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LayerCells:
+    """Cells about which something is known, by row, then column; NaN where a value is not."""
+
+    ix: NDArray[np.int64]
+    iy: NDArray[np.int64]
+    occupancy: _Floats
+    """Probability."""
+    floor_m: _Floats
+    top_m: _Floats
+    points: NDArray[np.uint32]
+    views: NDArray[np.uint32]
+    columns: Columns
+
+
+class _Tile:
+    """64 x 64 cells, [iy, ix]."""
+
+    def __init__(self, columns: Columns) -> None:
+        self.odds = np.zeros((columns.slices, TILE, TILE), np.int8)
+        self.heights = np.zeros((columns.bins, TILE, TILE), np.uint8)
+        """Keyframes that saw something so high, at most 255."""
+        self.points = np.zeros((TILE, TILE), np.uint32)
+        self.views = np.zeros((TILE, TILE), np.uint32)
+
+    def take(self, window: tuple[slice, slice], sight: Sight, part: tuple[slice, slice]) -> None:
+        """Add the part of a sight that lies over a window of the tile."""
+        rows, columns = part
+        change = np.int8(HIT) * sight.hit[:, rows, columns] + np.int8(PASS) * sight.passed[:, rows, columns]
+        odds = self.odds[:, window[0], window[1]]
+        odds[...] = np.clip(odds.astype(np.int16) + change, LEAST, MOST)
+        self.views[window] += sight.seen[part]
+        level, row, column = sight.marks
+        inside = (row >= rows.start) & (row < rows.stop) & (column >= columns.start) & (column < columns.stop)
+        place = row[inside] + window[0].start - rows.start, column[inside] + window[1].start - columns.start
+        np.add.at(self.points, place, sight.pixels[inside].astype(np.uint32))
+        heights = self.heights[level[inside], *place]
+        self.heights[level[inside], *place] = heights + (heights < 255)
+
+
+class Layers:
+    """Accumulates depth images at poses; gives cells."""
+
+    def __init__(self, columns: Columns) -> None:
+        self._columns = columns
+        self._tiles: dict[tuple[int, int], _Tile] = {}
+
+    def add(self, image: DepthImage, map_from_robot: SE2) -> bool:
+        """Take up one keyframe. False if its pose is too far away to be one."""
+        largest_m = min(LARGEST_M, LARGEST_CELL * self._columns.cell_m)
+        if not (abs(map_from_robot.x_m) < largest_m and abs(map_from_robot.y_m) < largest_m):
+            return False
+        sight = look(image, map_from_robot, self._columns)
+        if sight is not None:
+            for tile, window, part in self._tiles_under(sight):
+                tile.take(window, sight, part)
+        return True
+
+    def _tiles_under(self, sight: Sight) -> Iterator[tuple[_Tile, tuple[slice, slice], tuple[slice, slice]]]:
+        """Tiles of which something was seen, with the window of the tile and the part of the sight that meet."""
+        rows, columns = sight.seen.shape
+        for tile_y in range(sight.low // TILE, (sight.low + rows - 1) // TILE + 1):
+            for tile_x in range(sight.left // TILE, (sight.left + columns - 1) // TILE + 1):
+                window_y, part_y = _overlap(tile_y * TILE, sight.low, rows)
+                window_x, part_x = _overlap(tile_x * TILE, sight.left, columns)
+                if sight.seen[part_y, part_x].any():
+                    if (tile_y, tile_x) not in self._tiles:
+                        self._tiles[tile_y, tile_x] = _Tile(self._columns)
+                    yield self._tiles[tile_y, tile_x], (window_y, window_x), (part_y, part_x)
+
+    def cells(self) -> LayerCells:
+        """All cells of which anything is known."""
+        parts = [_known(place, tile, self._columns) for place, tile in sorted(self._tiles.items())]
+        parts = parts or [_known((0, 0), _Tile(self._columns), self._columns)]
+        whole = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
+        order = np.lexsort((whole[0], whole[1]))
+        ix, iy, occupancy, floor_m, top_m, points, views = (field[order] for field in whole)
+        return LayerCells(ix, iy, occupancy, floor_m, top_m, points, views, self._columns)
+
+
+def _overlap(tile_start: int, start: int, length: int) -> tuple[slice, slice]:
+    """Where a tile and [start, start + length) meet, seen from the tile and from the other."""
+    first, last = max(tile_start, start), min(tile_start + TILE, start + length)
+    return slice(first - tile_start, last - tile_start), slice(first - start, last - start)
+
+
+def _known(place: tuple[int, int], tile: _Tile, columns: Columns) -> tuple[NDArray[Any], ...]:
+    """The fields of `LayerCells`, in order, of the cells of a tile about which something is known."""
+    row, column = np.nonzero(tile.views)
+    odds, heights = tile.odds[:, row, column].T, tile.heights[:, row, column].T
+    occupancy, below = _occupancy(odds), columns.below * BINS
+    floor = _percentile(heights[:, :below], np.full(len(row), columns.base_m), FLOOR)
+    top = _tops(odds, heights[:, below:], columns)
+    kept = ~(np.isnan(occupancy) & np.isnan(floor) & np.isnan(top))
+    ix, iy = place[1] * TILE + column, place[0] * TILE + row
+    points, views = tile.points[row, column], tile.views[row, column]
+    return tuple(field[kept] for field in (ix, iy, occupancy, floor, top, points, views))
+
+
+def _occupancy(odds: NDArray[np.int8]) -> _Floats:
+    """Probabilities (n,) of log-odds (n, slices); NaN where nothing was found and too little was seen through."""
+    seen = np.where(odds == 0, np.int8(LEAST), odds).max(1)
+    height = np.where(odds != 0, np.arange(1, odds.shape[1] + 1), 0).max(1)
+    whole = ((odds != 0).sum(1) == height) & (height >= FREE_SHARE * odds.shape[1])
+    return np.where(whole | (seen > 0), 1.0 / (1.0 + np.exp(-seen / STEPS)), np.nan)
+
+
+def _tops(odds: NDArray[np.int8], heights: NDArray[np.uint8], columns: Columns) -> _Floats:
+    """(n,) top within the highest occupied slice; NaN where none is."""
+    occupied = odds > 0
+    highest = occupied.shape[1] - 1 - occupied[:, ::-1].argmax(1)
+    by_slice = heights.reshape(*occupied.shape, BINS)[np.arange(len(highest)), highest]
+    top = _percentile(by_slice, columns.low_m + highest * SLICE_M, TOP)
+    return np.where(occupied.any(1), np.minimum(top, columns.high_m), np.nan)
+
+
+def _percentile(counts: NDArray[np.uint8], start_m: _Floats, share: float) -> _Floats:
+    """Heights (n,) below which a share of what bins (n, bins) from `start_m` counted lies; NaN where they are empty."""
+    up_to = counts.cumsum(1, dtype=np.int64)
+    wanted = share * up_to[:, -1]
+    number = (up_to < wanted[:, None]).sum(1)
+    inside = np.take_along_axis(counts, np.minimum(number, counts.shape[1] - 1)[:, None], 1)[:, 0].astype(np.float64)
+    before = np.take_along_axis(up_to, np.minimum(number, counts.shape[1] - 1)[:, None], 1)[:, 0] - inside
+    part = np.divide(wanted - before, inside, out=np.full(len(counts), np.nan), where=up_to[:, -1] > 0)
+    return np.asarray(start_m + (number + part) * BIN_M)
