@@ -14,8 +14,8 @@ The semantic map's cells count as occupied if they are obstacles or objects, and
 held before there were layers. `nothing but floor` calls every cell free that anybody could have seen.
 
 Heights are those of tables, dressers, shelves and bins, whose tops are flat, up to the greatest height of obstacles:
-the median of the cells well inside the outline and away from anything else, against the true top. `always` tells
-the median true height of the same things.
+the median of the cells of the outline that are a true cell away from anything else, against the true top. `always`
+tells the median true height of the same things.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ TRUE_CELL_M = 0.1
 FREE, OCCUPIED = 0.196, 0.65
 FLAT = ("table", "dresser", "bookshelf", "bin")
 LEAST_CELLS = 4
-"""With a height, well inside an outline, for a height of the whole."""
+"""With a height, for a height of the whole."""
 
 HEAD = (
     *("map", "poses", "logs", "precision", "recall", "F1"),
@@ -211,7 +211,7 @@ def tops(homes: Path, folder: Path) -> Iterable[tuple[float, float]]:
     inside = (column >= 0) & (column < columns) & (line >= 0) & (line < lines)
     top[line[inside], column[inside]] = rows["top_m"][inside]
     for outline, class_id, height_m in flat_things(truth):
-        values = top[inner(outline, class_id, truth)]
+        values = top[covered(outline, class_id, truth)]
         values = values[~np.isnan(values)]
         if len(values) >= LEAST_CELLS and height_m < highest_m:
             yield float(np.median(values)), height_m
@@ -229,13 +229,13 @@ def flat_things(truth: Truth) -> Iterable[tuple[_Floats, int, float]]:
             yield map_from_home.apply(np.array(outline).reshape(-1, 2)), truth.classes.index(label), z_m + height_m
 
 
-def inner(outline: _Floats, class_id: int, truth: Truth) -> _Mask:
-    """Cells a cell away from the edge of an outline, and a cell of the true map away from anything else."""
+def covered(outline: _Floats, class_id: int, truth: Truth) -> _Mask:
+    """Cells of an outline, its edge included: its front is what one sees. Those beside anything else are left out."""
     corners = np.floor(outline / truth.cell_m - (truth.left, truth.low)).astype(np.int32)
     filled = np.zeros(truth.class_id.shape, np.uint8)
     cv2.fillPoly(filled, [corners], 1)
     others = (truth.class_id >= OBSTACLE) & (truth.class_id != class_id)
-    return (cv2.erode(filled, np.ones((3, 3), np.uint8)) > 0) & ~grown(others, truth.reach)
+    return (filled > 0) & ~grown(others, truth.reach)
 
 
 def height_row(name: str, estimator: str, errors: list[float]) -> str:

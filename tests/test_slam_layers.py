@@ -208,9 +208,18 @@ def test_poses_far_apart_cost_no_memory() -> None:
     assert peak < 100e6
     assert np.ptp(cells.ix) == pytest.approx(2e6 / 0.05, rel=0.01)
     assert occupancy_image(cells, FREE, OCCUPIED, 205) is None
-    for pose in (SE2(1e9, 0.0, 0.0), SE2(0.0, math.nan, 0.0), SE2(math.inf, 0.0, 0.0)):
+    for pose in (SE2(1e9, 0.0, 0.0), SE2(0.0, math.nan, 0.0), SE2(math.inf, 0.0, 0.0), SE2(0.0, 0.0, math.nan)):
         assert not layers.add(picture, pose)
     assert shown(cells).shape[0] < 2000
+
+
+def test_a_camera_that_claims_to_see_everything_costs_no_memory() -> None:
+    """A focal length of a hundredth of a pixel, from a camera info that nobody filled in, say."""
+    tracemalloc.start()
+    assert Layers(COLUMNS).add(replace(image(room(BOX), BEFORE), fx=0.01, fy=0.01), BEFORE)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 500e6
 
 
 def test_memory_does_not_grow_with_the_log() -> None:

@@ -31,6 +31,8 @@ NEAR_M = 0.3
 """Nearer points may be the robot itself."""
 COLUMNS = 160
 """Pictures are thinned to about so many columns."""
+WIDEST = 4.0
+"""Nor is looked farther to the side than so many times ahead (76 degrees), whatever the camera claims to see."""
 MARGIN = 0.005
 """A surface counts as farther than a place if it is by a cell and this, per metre, times the square of the distance:
 three standard deviations of a depth camera's noise."""
@@ -194,7 +196,8 @@ def _window(image: DepthImage, map_from_robot: SE2, cell_m: float, reach_m: floa
     """The cells over which the image may see so far."""
     height, width = image.depth_m.shape
     corners = np.array([[x, y] for x in (-0.5, width - 0.5) for y in (-0.5, height - 0.5)])
-    rays = np.column_stack([(corners - (image.cx, image.cy)) / (image.fx, image.fy), np.ones(4)]) * reach_m
+    slopes = np.clip((corners - (image.cx, image.cy)) / (image.fx, image.fy), -WIDEST, WIDEST)
+    rays = np.column_stack([slopes, np.ones(4)]) * reach_m
     in_camera = np.concatenate([rays, np.zeros((1, 3))])
     in_robot = in_camera @ image.robot_from_camera[:3, :3].T + image.robot_from_camera[:3, 3]
     cells = np.floor(map_from_robot.apply(in_robot[:, :2]) / cell_m).astype(np.int64)

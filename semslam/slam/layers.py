@@ -14,6 +14,7 @@ Memory grows with the mapped area, in tiles of 64 x 64 cells, not with time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -87,14 +88,18 @@ class Layers:
 
     def add(self, image: DepthImage, map_from_robot: SE2) -> bool:
         """Take up one keyframe. False if its pose is too far away to be one."""
-        largest_m = min(LARGEST_M, LARGEST_CELL * self._columns.cell_m)
-        if not (abs(map_from_robot.x_m) < largest_m and abs(map_from_robot.y_m) < largest_m):
+        if not self._holds(map_from_robot):
             return False
         sight = look(image, map_from_robot, self._columns)
         if sight is not None:
             for tile, window, part in self._tiles_under(sight):
                 tile.take(window, sight, part)
         return True
+
+    def _holds(self, pose: SE2) -> bool:
+        """Whether a pose is near enough to be one. Not so if it is no number."""
+        largest_m = min(LARGEST_M, LARGEST_CELL * self._columns.cell_m)
+        return abs(pose.x_m) < largest_m and abs(pose.y_m) < largest_m and math.isfinite(pose.heading_rad)
 
     def _tiles_under(self, sight: Sight) -> Iterator[tuple[_Tile, tuple[slice, slice], tuple[slice, slice]]]:
         """Tiles of which something was seen, with the window of the tile and the part of the sight that meet."""
