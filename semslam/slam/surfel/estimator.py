@@ -90,7 +90,10 @@ class SurfelEstimator:
         if len(smoothed.parts) < 2:
             return smoothed
         places = rejoined(smoothed, self._seen, self._grid)
-        return smooth(places, smoothed.bias, self._config, scale=scale) if places else smoothed
+        if places is None:
+            return smoothed
+        again = smooth(places, smoothed.bias, self._config, scale=scale)
+        return again if again.equations else smoothed
 
     def _known(self) -> Iterator[tuple[int, Place, Seen]]:
         """Number, place and observation of keyframes whose place pictures tell."""

@@ -26,15 +26,17 @@ def rejoined(smoothed: Smoothed, seen: Sequence[Seen], grid: Grid) -> list[Place
     """
     main, *others = smoothed.parts
     places, whole = list(smoothed.places), list(main)
+    there: Submap | None = None  # that of `whole`
     for part in sorted(others, key=len, reverse=True):
         if len(part) < _LEAST:
             break
-        found = place_in(_map(places, seen, grid, part), _map(places, seen, grid, whole)).other_from_own
+        there = there or _map(places, seen, grid, whole)
+        found = place_in(_map(places, seen, grid, part), there).other_from_own
         if found is not None:
             for index in part:
                 place = moved(places[index], found.matrix @ places[index].pose)
                 places[index] = replace(place, group=places[main[0]].group)
-            whole += part
+            whole, there = whole + part, None
     return places if len(whole) > len(main) else None
 
 
