@@ -12,7 +12,7 @@ from semslam.pipeline.cache import table_files
 from semslam.pipeline.job import InputFile, Job, Outcome
 from semslam.pipeline.worker import execute
 from semslam.stages.contract import Stage
-from semslam.tables.parquet import TableFiles
+from semslam.tables.parquet import TableFiles, rows_of
 from semslam.tables.spec import Table
 
 KEY = "0" * 64
@@ -31,8 +31,7 @@ class Done:
 
     def rows(self, table: Table) -> list[dict[str, Any]]:
         """A table as rows."""
-        columns = self.table(table).read()
-        return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+        return list(rows_of(self.table(table).batches()))
 
     @property
     def files(self) -> dict[str, tuple[InputFile, ...]]:

@@ -8,7 +8,7 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from semslam.tables.parquet import TableError, TableFiles, TableFileWriter, write_table
+from semslam.tables.parquet import TableError, TableFiles, TableFileWriter, rows_of, write_table
 from semslam.tables.spec import ALL_TABLES, MOTION, OBSERVATIONS, TYPES
 
 
@@ -36,6 +36,8 @@ def test_rows_come_back_across_shards(tmp_path: Path) -> None:
     parts = list(table.batches(["frame"], start=3, stop=8, batch_rows=2))
     assert [frame for part in parts for frame in part["frame"]] == [3, 4, 5, 6, 7]
     assert all(len(part["frame"]) <= 2 for part in parts)
+    rows = list(rows_of(table.batches(["frame", "source"], start=4, batch_rows=2)))
+    assert rows == [{"frame": frame, "source": "odometry"} for frame in range(4, 9)]
 
 
 def test_same_rows_same_bytes(tmp_path: Path) -> None:

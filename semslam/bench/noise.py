@@ -29,7 +29,7 @@ from semslam.models.training.drives import simulating
 from semslam.slam.estimator import Step
 from semslam.slam.registry import open_estimator
 from semslam.stages.settings import LocalizeConfig, PaperConfig
-from semslam.tables.parquet import TableFiles, made_by
+from semslam.tables.parquet import TableFiles, made_by, rows_of
 from semslam.tables.spec import MOTION, OBSERVATIONS, TRUTH
 
 TASK = "semslam.bench.noise:track"
@@ -109,11 +109,10 @@ def _one(arguments: Mapping[str, Any], log: str, config: LocalizeConfig) -> dict
 
 def _observed(table: TableFiles, shape: tuple[int, int, int]) -> Iterator[tuple[int, Planes]]:
     """Stamps and dense observations."""
-    for batch in table.batches(["stamp_nanos", "cells", "weights"]):
-        for stamp, cells, weights in zip(*batch.values(), strict=True):
-            planes = to_dense(np.array(cells, np.uint32), np.array(weights, np.float32), shape)
-            planes[UNOBSERVED] = ~planes[1:].any(0)
-            yield stamp, planes
+    for row in rows_of(table.batches(["stamp_nanos", "cells", "weights"])):
+        planes = to_dense(np.array(row["cells"], np.uint32), np.array(row["weights"], np.float32), shape)
+        planes[UNOBSERVED] = ~planes[1:].any(0)
+        yield row["stamp_nanos"], planes
 
 
 def _motions(motion: list[Path], truth: Path, level: float) -> Iterator[tuple[int, SE2 | None]]:

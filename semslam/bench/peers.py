@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from semslam.errors import SemslamError
 from semslam.geometry.frames import SE2, planar
 from semslam.geometry.projection import points_in_robot
-from semslam.tables.parquet import TableFiles
+from semslam.tables.parquet import TableFiles, rows_of
 from semslam.tables.pictures import decode_colour, decode_depth
 from semslam.tables.spec import FRAMES, MOTION
 
@@ -93,18 +93,16 @@ def keyframes(frames: list[Path], motion: list[Path]) -> Iterator[Keyframe]:
     """All keyframes of a log."""
     moved = TableFiles(MOTION, motion).read(["stamp_nanos", "dx_m", "dy_m", "dheading_rad"])
     motions = dict(zip(moved["stamp_nanos"], zip(*(moved[n] for n in list(moved)[1:]), strict=True), strict=True))
-    for batch in TableFiles(FRAMES, frames).batches(batch_rows=4):
-        for values in zip(*batch.values(), strict=True):
-            row = dict(zip(batch, values, strict=True))
-            known = motions.get(row["stamp_nanos"], (None,))
-            yield Keyframe(
-                row["stamp_nanos"],
-                decode_colour(row["colour"]),
-                decode_depth(row["depth"]),
-                (row["fx"], row["fy"], row["cx"], row["cy"]),
-                np.array(row["robot_from_camera"], np.float64).reshape(4, 4),
-                None if None in known else SE2(*known),
-            )
+    for row in rows_of(TableFiles(FRAMES, frames).batches(batch_rows=4)):
+        known = motions.get(row["stamp_nanos"], (None,))
+        yield Keyframe(
+            row["stamp_nanos"],
+            decode_colour(row["colour"]),
+            decode_depth(row["depth"]),
+            (row["fx"], row["fy"], row["cx"], row["cy"]),
+            np.array(row["robot_from_camera"], np.float64).reshape(4, 4),
+            None if None in known else SE2(*known),
+        )
 
 
 def small_gicp(frames: Iterator[Keyframe], folder: Path) -> Poses:

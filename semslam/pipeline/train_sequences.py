@@ -31,7 +31,7 @@ from semslam.slam.deepvo_estimator import DeepVoEstimator
 from semslam.slam.estimator import Estimator, Step
 from semslam.slam.mapnet_estimator import MapNetEstimator
 from semslam.slam.views import view_of
-from semslam.tables.parquet import TableFiles
+from semslam.tables.parquet import TableFiles, rows_of
 from semslam.tables.spec import FRAMES, MOTION, TRUTH
 
 SCORED = 30
@@ -169,7 +169,6 @@ def walk(estimator: Estimator, frames: Sequence[Path], steps: int) -> Track:
 
 def _steps(frames: Sequence[Path], steps: int) -> Iterator[Step]:
     """The first keyframes of a frames table, with nothing but their views."""
-    batches = TableFiles(FRAMES, frames).batches(_VIEW, batch_rows=8)
-    rows = (dict(zip(batch, row, strict=True)) for batch in batches for row in zip(*batch.values(), strict=True))
+    rows = rows_of(TableFiles(FRAMES, frames).batches(_VIEW, batch_rows=8))
     for row in islice(rows, steps):
         yield Step(row["frame"], row["stamp_nanos"], None, None, view_of(row))

@@ -39,12 +39,13 @@ from semslam.slam.picture import MapCells, Path
 from semslam.slam.render import render_map
 from semslam.stages.contract import ShardWriter, StageContext, TableSource
 from semslam.stages.settings import ExportConfig
-from semslam.tables.parquet import TableFileWriter, write_table
+from semslam.tables.parquet import TableFileWriter, rows_of, write_table
 from semslam.tables.pictures import decode_depth
 from semslam.tables.spec import CELLS, DETECTIONS, FRAMES, LAYERS, OBJECTS, PLACES, POSES, TRAJECTORY
 
 _POSE = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad", "verdict")
-_PICTURE = ["frame", "depth", "fx", "fy", "cx", "cy", "robot_from_camera"]
+_PICTURE = ("frame", "depth", "fx", "fy", "cx", "cy", "robot_from_camera")
+_DETECTION = ("frame", "stamp_nanos", "class_id", "score", "mask_runs", "depth_pixels")
 _FILES = 9
 
 _Table = Mapping[str, list[Any]]
@@ -134,9 +135,9 @@ def _patches(
     frames: TableSource, detections: TableSource, poses: Mapping[int, SE2], max_depth_m: float
 ) -> Iterator[Patch]:
     """What each detection of keyframes with a pose covers of the ground."""
-    pictures = _rows(frames, _PICTURE)
-    columns = ["frame", "stamp_nanos", "class_id", "score", "mask_runs", "depth_pixels"]
-    for frame, group in groupby(_rows(detections, columns), key=lambda row: row["frame"]):
+    pictures = rows_of(frames.batches(_PICTURE, batch_rows=8))
+    found = rows_of(detections.batches(_DETECTION, batch_rows=8))
+    for frame, group in groupby(found, key=lambda row: row["frame"]):
         picture = next((row for row in pictures if row["frame"] == frame), None)
         if picture is not None and frame in poses:
             yield from _patches_of(picture, list(group), poses[frame], max_depth_m)
@@ -161,12 +162,6 @@ def _patches_of(
             yield patch
 
 
-def _rows(table: TableSource, columns: list[str]) -> Iterator[dict[str, Any]]:
-    for batch in table.batches(columns, batch_rows=8):
-        for values in zip(*batch.values(), strict=True):
-            yield dict(zip(batch, values, strict=True))
-
-
 def _map_cells(rows: _Table, meta: Mapping[str, Any]) -> MapCells:
     ix, iy, class_id = (np.array(rows[name], np.int64) for name in ("ix", "iy", "class_id"))
     return MapCells(ix, iy, class_id, tuple(meta["classes"]), float(meta["cell_m"]))
@@ -185,7 +180,7 @@ def _layers(ctx: StageContext, poses: Mapping[int, SE2], config: ExportConfig) -
     """Occupancy and heights from the depth of all keyframes with a pose."""
     low_m, high_m = config.min_obstacle_height_m, config.max_obstacle_height_m
     layers = Layers(Columns(config.layer_cell_m, low_m, high_m, config.layer_depth_m))
-    for picture in _rows(ctx.read(FRAMES), _PICTURE):
+    for picture in rows_of(ctx.read(FRAMES).batches(_PICTURE, batch_rows=8)):
         if picture["frame"] in poses:
             fx, fy, cx, cy = (picture[name] for name in ("fx", "fy", "cx", "cy"))
             robot_from_camera = np.array(picture["robot_from_camera"], np.float64).reshape(4, 4)

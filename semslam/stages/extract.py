@@ -29,6 +29,7 @@ from semslam.models.memory import keep_freed_memory
 from semslam.models.segmenters import Segmenter, open_segmenter
 from semslam.stages.contract import ShardWriter, StageContext, row_shards
 from semslam.stages.settings import ExtractConfig
+from semslam.tables.parquet import rows_of
 from semslam.tables.pictures import decode_colour, decode_depth
 from semslam.tables.spec import DETECTIONS, FRAMES, OBSERVATIONS
 
@@ -54,7 +55,7 @@ def run(ctx: StageContext) -> None:
     for index, start, stop in row_shards(frames.rows, config.shard_frames):
         if index < len(ctx.finished):
             continue
-        groups = ahead(_groups(_rows(frames.batches(None, start, stop, _ROWS_READ)), config))
+        groups = ahead(_groups(rows_of(frames.batches(None, start, stop, _ROWS_READ)), config))
         recognised = chain.from_iterable(ahead(_recognised(groups, eyes)))
         with ctx.shard(index) as shard:
             failures = _fill(shard, _counted(recognised, ctx, start, frames.rows), eyes)
@@ -346,13 +347,6 @@ def ahead(items: Iterator[T]) -> Iterator[T]:
         while (item := coming.result()) is not None:
             coming = pool.submit(next, items, None)
             yield item
-
-
-def _rows(batches: Iterator[dict[str, list[Any]]]) -> Iterator[Row]:
-    """The rows of batches of columns."""
-    for batch in batches:
-        for values in zip(*batch.values(), strict=True):
-            yield dict(zip(batch, values, strict=True))
 
 
 def _groups(rows: Iterator[Row], config: ExtractConfig) -> Iterator[list[Frame]]:

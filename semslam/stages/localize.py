@@ -38,6 +38,7 @@ from semslam.slam.verdict import verdict_of
 from semslam.slam.views import view_of
 from semslam.stages.contract import FinishedShard, ShardWriter, StageContext, TableSink, TableSource, row_shards
 from semslam.stages.settings import LocalizeConfig
+from semslam.tables.parquet import rows_of
 from semslam.tables.spec import CELLS, FRAMES, MOTION, OBSERVATIONS, PLACES, POSES, SNAPSHOTS
 
 _STATE = "state.npz"
@@ -242,7 +243,7 @@ def _steps(
     """Motion rows [start, stop), each with the observation, and if wanted the view, of its frame if there is one."""
     sights = _Beside(observations)
     pictures = _Beside(frames, _VIEW) if frames else None
-    for row in _rows(motion, start, stop):
+    for row in rows_of(motion.batches(None, start, stop, _ROWS_READ)):
         sight = sights.at(row["frame"])
         picture = pictures.at(row["frame"]) if pictures else None
         observation = None if sight is None else _planes(sight, shape)
@@ -264,20 +265,12 @@ class _Beside:
         """The row of the frame; None if there is none."""
         if self._rows is None:
             first = int(np.searchsorted(self._frames, frame))
-            self._rows = _rows(self._table, first, None, self._columns)
+            self._rows = rows_of(self._table.batches(self._columns, first, None, _ROWS_READ))
             self._row = next(self._rows, None)
         if self._row is None or self._row["frame"] != frame:
             return None
         found, self._row = self._row, next(self._rows, None)
         return found
-
-
-def _rows(
-    table: TableSource, start: int, stop: int | None, columns: list[str] | None = None
-) -> Iterator[dict[str, Any]]:
-    for batch in table.batches(columns, start, stop, _ROWS_READ):
-        for values in zip(*batch.values(), strict=True):
-            yield dict(zip(batch, values, strict=True))
 
 
 def _motion(row: Mapping[str, Any]) -> SE2 | None:

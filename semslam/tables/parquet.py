@@ -9,7 +9,7 @@ rows (class list, grid) lies as canonical JSON in the file's metadata under `sem
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -176,6 +176,13 @@ class TableFiles:
             for name in names:
                 whole[name] += batch[name]
         return whole
+
+
+def rows_of(batches: Iterable[Mapping[str, Sequence[Any]]]) -> Iterator[dict[str, Any]]:
+    """The rows of batches of columns, one by one, by the names of the columns."""
+    for batch in batches:
+        for values in zip(*batch.values(), strict=True):
+            yield dict(zip(batch, values, strict=True))
 
 
 def _leaf(column: Column) -> str:

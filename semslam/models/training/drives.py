@@ -25,7 +25,7 @@ from semslam.geometry.frames import SE2
 from semslam.geometry.grid import Planes, object_planes, pool_observation, to_dense, to_sparse
 from semslam.labels import UNOBSERVED
 from semslam.stages.settings import PaperConfig
-from semslam.tables.parquet import TableFiles, made_by
+from semslam.tables.parquet import TableFiles, made_by, rows_of
 from semslam.tables.spec import MOTION, OBSERVATIONS, SPLITS, TRUTH
 from semslam.tables.true_map import TrueMap, read_true_map
 
@@ -306,10 +306,9 @@ def _pooled(
     table: TableFiles, wanted: set[int], shape: tuple[int, int, int], factor: int, config: PaperConfig
 ) -> Iterator[tuple[int, Planes]]:
     """Stamp and coarse planes of each row that is wanted."""
-    for batch in table.batches(["stamp_nanos", "cells", "weights"]):
-        for stamp, cells, weights in zip(batch["stamp_nanos"], batch["cells"], batch["weights"], strict=True):
-            if stamp in wanted:
-                yield stamp, coarse_observation(cells, weights, shape, factor, config)
+    for row in rows_of(table.batches(["stamp_nanos", "cells", "weights"])):
+        if row["stamp_nanos"] in wanted:
+            yield row["stamp_nanos"], coarse_observation(row["cells"], row["weights"], shape, factor, config)
 
 
 def coarse_observation(

@@ -25,7 +25,7 @@ from semslam.errors import SemslamError
 from semslam.geometry.frames import wrap_angles
 from semslam.models.onnxfile import file_digest
 from semslam.models.small_view import HEIGHT, PART, WIDTH, SmallView, network_input, small_view
-from semslam.tables.parquet import TableFiles
+from semslam.tables.parquet import TableFiles, rows_of
 from semslam.tables.pictures import decode_colour, decode_depth
 from semslam.tables.spec import FRAMES, TRUTH
 
@@ -219,10 +219,9 @@ def _made(files: DriveFiles) -> dict[str, NDArray[Any]]:
     pose_at = dict(zip(truth["stamp_nanos"], places, strict=True))
     stamps: list[int] = []
     views: list[SmallView] = []
-    for rows in TableFiles(FRAMES, files.frames).batches(_COLUMNS, batch_rows=8):
-        for row in (dict(zip(rows, values, strict=True)) for values in zip(*rows.values(), strict=True)):
-            stamps.append(row["stamp_nanos"])
-            views.append(_small(row))
+    for row in rows_of(TableFiles(FRAMES, files.frames).batches(_COLUMNS, batch_rows=8)):
+        stamps.append(row["stamp_nanos"])
+        views.append(_small(row))
     nowhere = (math.nan, math.nan, math.nan)
     poses = np.array([pose_at.get(stamp, nowhere) for stamp in stamps], np.float64).reshape(-1, 3)
     if not np.isfinite(poses).all(1).any():

@@ -5,7 +5,7 @@ A reader needs nothing else: the semantic map is laid out again from the observa
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from semslam.slam.surfel.semantic_field import ClassMap
 from semslam.slam.surfel.sight import Sight
 from semslam.slam.surfel.surfels import Surfels
 from semslam.slam.surfel.tracking import Keyframe, Place, placed
-from semslam.tables.parquet import TableFiles, made_by
+from semslam.tables.parquet import TableFiles, made_by, rows_of
 from semslam.tables.pictures import decode_depth, encode_depth
 from semslam.tables.spec import PLACES
 
@@ -106,7 +106,7 @@ def read_prior(path: Path, grid: Grid) -> Submap:
     seen: list[Seen] = []
     try:
         with made_by(_COMMAND):
-            for row in _rows(table):
+            for row in rows_of(table.batches(batch_rows=8)):
                 places.append(_place(row))
                 seen.append(Seen(np.array(row["cells"], np.uint32), np.array(row["weights"], np.float32)))
         return submap_of(places, seen, grid)
@@ -114,12 +114,6 @@ def read_prior(path: Path, grid: Grid) -> Submap:
         raise SemslamError(
             f"Row {len(places)} of map `{path}` is no place: {error}", hint=f"make it again: `{_COMMAND}`"
         ) from error
-
-
-def _rows(table: TableFiles) -> Iterator[dict[str, Any]]:
-    for batch in table.batches(batch_rows=8):
-        for values in zip(*batch.values(), strict=True):
-            yield dict(zip(batch, values, strict=True))
 
 
 def open_prior(path: Path, grid: Grid) -> TableFiles:
