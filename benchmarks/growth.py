@@ -25,14 +25,12 @@ from machine import machine
 
 from semslam.bench.peers import Keyframe, keyframes
 from semslam.geometry.frames import SE2
-from semslam.pipeline.cache import EntryIndex, table_files
-from semslam.pipeline.folder import OutputFolder
-from semslam.pipeline.record import load_records
+from semslam.pipeline.run_tables import run_tables
 from semslam.slam.estimator import Step, View
 from semslam.slam.surfel.estimator import SurfelEstimator
 from semslam.slam.surfel.prior import Grid
 from semslam.stages.settings import SurfelConfig
-from semslam.tables.spec import FRAMES, MOTION, Table
+from semslam.tables.spec import FRAMES, MOTION
 
 SECOND = 1_000_000_000
 
@@ -103,7 +101,11 @@ METHODS = {"surfel": surfel, "small_gicp": small_gicp}
 
 def first_keyframes(out: Path, log: str) -> list[Keyframe]:
     """At most 80 keyframes of a log, decoded."""
-    return list(islice(keyframes(*files_of(out, log)), 80))
+    found = run_tables(out, (FRAMES, MOTION), [log] if log else None)
+    tables = next(iter(found.values()), {})
+    if len(tables) < 2:
+        raise SystemExit(f"the run has no keyframes of `{log}`" if log else "the run has no keyframes")
+    return list(islice(keyframes(tables[FRAMES.name], tables[MOTION.name]), 80))
 
 
 def there_and_back(whole: Sequence[Keyframe], length: int) -> Iterator[Keyframe]:
@@ -121,21 +123,6 @@ def between(whole: Sequence[Keyframe], place: int, way: int) -> SE2 | None:
         return whole[place].motion
     motion = whole[place + 1].motion
     return motion.inverse() if motion else None
-
-
-def files_of(out: Path, log: str) -> tuple[list[Path], list[Path]]:
-    """Files of the frames and motion tables of a log of a run."""
-    folder = OutputFolder(out)
-    records = load_records(folder.logs)
-    record = records[log] if log else next(iter(records.values()))
-    index = EntryIndex(folder.cache)
-
-    def of(table: Table) -> list[Path]:
-        entry = index.find(table.stage, record.tasks[table.stage].key)
-        assert entry is not None
-        return [Path(file.path) for file in table_files(folder.stage(table.stage) / entry.key)[table.name]]
-
-    return of(FRAMES), of(MOTION)
 
 
 def peak_mb() -> float:

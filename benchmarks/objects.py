@@ -21,9 +21,11 @@ import numpy as np
 from machine import machine
 from numpy.typing import NDArray
 
+from semslam.bench.tracks import true_track
 from semslam.geometry.frames import SE2
+from semslam.slam.objects import centroid
 from semslam.tables.parquet import TableFiles
-from semslam.tables.spec import CELLS, HOME_OBJECTS, OBJECTS, TRUTH
+from semslam.tables.spec import CELLS, HOME_OBJECTS, OBJECTS
 
 NEAR_M = 0.5
 SEEN = 0.2
@@ -102,22 +104,14 @@ def objects_of(folder: Path) -> list[Thing]:
 
 def truth_of(homes: Path, log: str) -> list[Thing]:
     """The objects of the home in the log's map frame: that of its first keyframe."""
-    truth = TableFiles(TRUTH, [homes / "truth" / log / "truth.parquet"]).read(["x_m", "y_m", "heading_rad"])
-    start = SE2(*(truth[name][0] for name in ("x_m", "y_m", "heading_rad"))).inverse().matrix
+    truth = true_track(homes, log, 1)
+    start = SE2(truth.x_m.item(), truth.y_m.item(), truth.heading_rad.item()).inverse().matrix
     rows = TableFiles(HOME_OBJECTS, [homes / "truth" / log / "home_objects.parquet"]).read(["label", "footprint"])
     found = []
     for label, outline in zip(rows["label"], rows["footprint"], strict=True):
         here = np.array(outline).reshape(-1, 2) @ start[:2, :2].T + start[:2, 3]
-        found.append(Thing(label, middle_of(here), here))
+        found.append(Thing(label, centroid(here), here))
     return found
-
-
-def middle_of(outline: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Centroid of the area within."""
-    moments = cv2.moments(outline.astype(np.float32))
-    if moments["m00"] <= 0:
-        return np.asarray(outline.mean(0))
-    return np.array([moments["m10"], moments["m01"]]) / moments["m00"]
 
 
 def share_seen(one: Thing, seen: NDArray[np.float64], cell_m: float = 0.1) -> float:

@@ -21,12 +21,11 @@ from typing import Any
 
 from machine import machine
 
+from semslam.bench.tracks import true_track
 from semslam.geometry.frames import SE2
-from semslam.pipeline.cache import EntryIndex, table_files
-from semslam.pipeline.folder import OutputFolder
-from semslam.pipeline.record import load_records
+from semslam.pipeline.run_tables import run_tables
 from semslam.tables.parquet import TableFiles
-from semslam.tables.spec import POSES, SPLITS, TRUTH
+from semslam.tables.spec import POSES, SPLITS
 
 NEAR_M, NEAR_DEG = 0.10, 2.0
 FIRST = 5
@@ -116,20 +115,15 @@ def look(homes: Path, out: Path, log: Log, other: Log, common: Sequence[str]) ->
     prior = out / "results" / other.name / "surfel"
     path = homes / "logs" / f"{log.name}.mcap"
     subprocess.run([*SEMSLAM, "localize", str(path), "--prior", str(prior), *common], check=True, capture_output=True)
-    folder = OutputFolder(out)
-    task = load_records(folder.logs)[log.name].tasks["localize/surfel"]
-    entry = EntryIndex(folder.cache).find("localize", task.key)
-    assert entry is not None
-    files = table_files(folder.stage("localize") / entry.key)[POSES.name]
-    rows = TableFiles(POSES, [Path(file.path) for file in files]).read()
+    rows = TableFiles(POSES, run_tables(out, (POSES,), [log.name], "surfel")[log.name][POSES.name]).read()
     return judged(log, other, rows, truth(homes, log), truth(homes, other))
 
 
 def truth(homes: Path, log: Log) -> dict[int, SE2]:
     """World_from_robot by stamp."""
-    rows = TableFiles(TRUTH, [homes / "truth" / log.name / "truth.parquet"]).read()
-    poses = zip(rows["x_m"], rows["y_m"], rows["heading_rad"], strict=True)
-    return {stamp: SE2(*pose) for stamp, pose in zip(rows["stamp_nanos"], poses, strict=True)}
+    track = true_track(homes, log.name)
+    columns = (track.stamp_nanos, track.x_m, track.y_m, track.heading_rad)
+    return {stamp: SE2(*pose) for stamp, *pose in zip(*(column.tolist() for column in columns), strict=True)}
 
 
 def judged(log: Log, other: Log, rows: dict[str, list[Any]], own: dict[int, SE2], theirs: dict[int, SE2]) -> Found:

@@ -24,11 +24,9 @@ from machine import machine
 from semslam.bench.peers import track
 from semslam.bench.tracks import column_track
 from semslam.metrics import Score, Track, score
-from semslam.pipeline.cache import EntryIndex, table_files
-from semslam.pipeline.folder import OutputFolder
-from semslam.pipeline.record import LogRecord, load_records
+from semslam.pipeline.run_tables import run_tables
 from semslam.tables.parquet import TableFiles
-from semslam.tables.spec import FRAMES, MOTION, TRUTH, Table
+from semslam.tables.spec import FRAMES, MOTION, TRUTH
 
 RATES_HZ = (10.0, 2.0, 1.0, 0.5, 0.2)
 ESTIMATORS = ("surfel", "paper", "paper_visual", "orb_rgbd", "mapnet", "deepvo", "dead_reckoning")
@@ -84,29 +82,22 @@ def at_rate(rate: float, logs: Sequence[Path], out: Path, estimators: Sequence[s
     scores: dict[str, list[Mapping[str, Any]]] = {}
     for line in json.loads(told.stdout)["scores"]:
         scores.setdefault(line["estimator"], []).append(line)
-    scores[PEER] = [vars(one) for one in peer_scores(OutputFolder(folder))]
+    scores[PEER] = [vars(one) for one in peer_scores(folder)]
     return {name: mean(lines) for name, lines in scores.items()}
 
 
-def peer_scores(folder: OutputFolder) -> list[Score]:
+def peer_scores(run: Path) -> list[Score]:
     """small_gicp on motion, on the keyframes that the estimators had."""
-    found, index = [], EntryIndex(folder.cache)
-    for record in load_records(folder.logs).values():
-        frames, motion, told = (files_of(folder, index, record, table) for table in (FRAMES, MOTION, TRUTH))
-        columns = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")
+    found = []
+    columns = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")
+    for tables in run_tables(run, (FRAMES, MOTION, TRUTH)).values():
+        frames, motion, told = (tables[table.name] for table in (FRAMES, MOTION, TRUTH))
         rows = TableFiles(TRUTH, told).read(columns)
         truth = Track.of(*(rows[name] for name in columns))
         arguments = {"peer": PEER, "frames": frames, "motion": motion, "steps": len(rows["frame"])}
         with tempfile.TemporaryDirectory() as temporary:
             found.append(score(truth, column_track(track(arguments, Path(temporary)), truth)))
     return found
-
-
-def files_of(folder: OutputFolder, index: EntryIndex, record: LogRecord, table: Table) -> list[Path]:
-    """The files of a table of ingest."""
-    entry = index.find(table.stage, record.tasks[table.stage].key)
-    assert entry is not None
-    return [Path(file.path) for file in table_files(folder.stage(table.stage) / entry.key)[table.name]]
 
 
 def mean(lines: Sequence[Mapping[str, Any]]) -> Point:

@@ -10,11 +10,12 @@ import pytest
 from semslam.geometry.frames import SE2
 from semslam.pipeline.cli import run_command
 from semslam.pipeline.evaluate import compose
+from semslam.pipeline.run_tables import run_tables
 from semslam.slam.dead_reckoning import DeadReckoning
 from semslam.slam.estimator import Step
 from semslam.tables.parquet import TableFiles
-from semslam.tables.spec import EVALUATION
-from tests.fake_robot import ROBOT_STAGES
+from semslam.tables.spec import EVALUATION, MOTION, POSES
+from tests.fake_robot import DRIFT_M, ROBOT_STAGES
 from tests.fake_stages import make_log
 from tests.pipeline_helpers import World
 
@@ -45,6 +46,18 @@ def test_every_estimator_is_scored_beside_luck_and_standing_still(world: World, 
     table = TableFiles(EVALUATION, [world.out / "results" / "evaluation.parquet"]).read()
     assert table["estimator"] == list(scores)
     assert table["ape_m"] == [score["ape_m"] for score in told["scores"]]
+
+
+def test_tables_of_a_run_are_found_by_estimator(world: World) -> None:
+    """Poses of the one that is named; tables of earlier stages beside them, whichever it is."""
+    make_log(world.logs, "a")
+    world.run("localize.estimators=paper,dead_reckoning", stages=ROBOT_STAGES, until="localize")
+    found = {name: run_tables(world.out, (MOTION, POSES), variant=name)["a"] for name in ("paper", "dead_reckoning")}
+    for name, files in found.items():
+        assert TableFiles(POSES, files[POSES.name]).read(["y_m"])["y_m"][1] == DRIFT_M[name]
+        assert TableFiles(MOTION, files[MOTION.name]).rows == 5
+    for name in ("", "mapnet"):
+        assert set(run_tables(world.out, (MOTION, POSES), variant=name)["a"]) == {MOTION.name}
 
 
 def test_the_table_for_people(world: World, capsys: Capture) -> None:

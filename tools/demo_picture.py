@@ -17,15 +17,13 @@ from numpy.typing import NDArray
 
 from semslam.geometry import rle
 from semslam.labels import FIRST_OBJECT
-from semslam.pipeline.cache import EntryIndex, table_files
-from semslam.pipeline.folder import OutputFolder
-from semslam.pipeline.record import LogRecord, load_records
+from semslam.pipeline.run_tables import LogTables, run_tables
 from semslam.slam.canvas import BOLD, Canvas
 from semslam.slam.palette import SOFT_INK, Colour, class_colours
 from semslam.slam.panel import LEFT, TOP, draw_panel, fit_view
 from semslam.slam.picture import MapCells
 from semslam.slam.picture import Path as Way
-from semslam.tables.parquet import TableFiles
+from semslam.tables.parquet import TableFiles, rows_of
 from semslam.tables.pictures import decode_colour
 from semslam.tables.spec import DETECTIONS, FRAMES, OBSERVATIONS, Table
 
@@ -41,13 +39,12 @@ def main() -> None:
     parser.add_argument("--estimator", default="surfel")
     parser.add_argument("--out", type=Path, default=Path("docs/demo.png"))
     args = parser.parse_args()
-    folder = OutputFolder(args.run)
-    (record,) = load_records(folder.logs).values()
-    mapped = cv2.imread(str(args.run / "results" / record.name / args.estimator / "map.png"))
+    ((log, tables),) = run_tables(args.run, (FRAMES, DETECTIONS, OBSERVATIONS)).items()
+    mapped = cv2.imread(str(args.run / "results" / log / args.estimator / "map.png"))
     if mapped is None:
         raise SystemExit(f"the run has no map of `{args.estimator}`")
-    colours = _colours(args.run / "results" / record.name / args.estimator / "map.parquet")
-    camera, observed = _camera(folder, record, args.frame, colours), _observation(folder, record, args.frame, colours)
+    colours = _colours(args.run / "results" / log / args.estimator / "map.parquet")
+    camera, observed = _camera(tables, args.frame, colours), _observation(tables, args.frame, colours)
     left = np.vstack(
         [_titled("What the camera sees", camera), _titled("What one frame says: observation map", observed)]
     )
@@ -64,18 +61,16 @@ def _colours(table: Path) -> dict[str, Colour]:
     return class_colours(label for class_id, label in zip(*columns.values(), strict=True) if class_id >= FIRST_OBJECT)
 
 
-def _rows(folder: OutputFolder, record: LogRecord, table: Table, frame: int) -> list[dict[str, Any]]:
+def _rows(tables: LogTables, table: Table, frame: int) -> list[dict[str, Any]]:
     """Rows of a table for one keyframe."""
-    columns = _table(folder, record, table).read()
-    rows = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
-    return [row for row in rows if row["frame"] == frame]
+    return [row for row in rows_of(_table(tables, table).batches()) if row["frame"] == frame]
 
 
-def _camera(folder: OutputFolder, record: LogRecord, frame: int, colours: dict[str, Colour]) -> Image:
+def _camera(tables: LogTables, frame: int, colours: dict[str, Colour]) -> Image:
     """The frame with masks and boxes of what was detected."""
-    rgb = decode_colour(_rows(folder, record, FRAMES, frame)[0]["colour"])
+    rgb = decode_colour(_rows(tables, FRAMES, frame)[0]["colour"])
     picture = np.ascontiguousarray(rgb[:, :, ::-1])
-    found = _rows(folder, record, DETECTIONS, frame)
+    found = _rows(tables, DETECTIONS, frame)
     colours = class_colours(row["label"] for row in found) | colours
     for row in found:
         mask = rle.decode(row["mask_runs"], *picture.shape[:2])
@@ -92,9 +87,9 @@ def _camera(folder: OutputFolder, record: LogRecord, frame: int, colours: dict[s
     return canvas.image
 
 
-def _observation(folder: OutputFolder, record: LogRecord, frame: int, colours: dict[str, Colour]) -> Image:
+def _observation(tables: LogTables, frame: int, colours: dict[str, Colour]) -> Image:
     """The observation of the frame: the likeliest class of every cell, the robot in the middle looking right."""
-    meta, row = _table(folder, record, OBSERVATIONS).meta, _rows(folder, record, OBSERVATIONS, frame)[0]
+    meta, row = _table(tables, OBSERVATIONS).meta, _rows(tables, OBSERVATIONS, frame)[0]
     side, classes = int(meta["side"]), tuple(meta["classes"])
     cells = np.asarray(row["cells"], np.int64)
     class_id, place = cells // side**2, cells % side**2
@@ -107,12 +102,10 @@ def _observation(folder: OutputFolder, record: LogRecord, frame: int, colours: d
     return _panel(seen, way, class_colours(classes[c] for c in seen.objects()) | colours)
 
 
-def _table(folder: OutputFolder, record: LogRecord, table: Table) -> TableFiles:
-    entry = EntryIndex(folder.cache).find(table.stage, record.tasks[table.stage].key)
-    if entry is None:
+def _table(tables: LogTables, table: Table) -> TableFiles:
+    if table.name not in tables:
         raise SystemExit(f"the run has no {table.name}")
-    files = table_files(folder.stage(table.stage) / entry.key)[table.name]
-    return TableFiles(table, [Path(file.path) for file in files])
+    return TableFiles(table, tables[table.name])
 
 
 def _panel(cells: MapCells, way: Way, colours: dict[str, Colour]) -> Image:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import importlib
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import islice, tee
@@ -89,7 +89,7 @@ def track(arguments: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     return dict(rows)
 
 
-def keyframes(frames: list[Path], motion: list[Path]) -> Iterator[Keyframe]:
+def keyframes(frames: Sequence[Path], motion: Sequence[Path]) -> Iterator[Keyframe]:
     """All keyframes of a log."""
     moved = TableFiles(MOTION, motion).read(["stamp_nanos", "dx_m", "dy_m", "dheading_rad"])
     motions = dict(zip(moved["stamp_nanos"], zip(*(moved[n] for n in list(moved)[1:]), strict=True), strict=True))

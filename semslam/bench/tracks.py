@@ -133,8 +133,8 @@ class TrackScore:
     turn_deg: tuple[float, ...]
 
 
-def true_track(dataset: Path, log: str, steps: int) -> Track:
-    """The exact track of the first keyframes of a log."""
+def true_track(dataset: Path, log: str, steps: int | None = None) -> Track:
+    """The exact track of the first `steps` keyframes of a log, world_from_robot; None means all."""
     with made_by(simulating(dataset)):
         rows = TableFiles(TRUTH, [dataset / "truth" / log / "truth.parquet"]).read()
     if not rows["frame"]:

@@ -16,12 +16,12 @@ from typing import Any
 from semslam.errors import SemslamError
 from semslam.geometry.frames import SE2
 from semslam.metrics import Score, Track, chance, errors, score, standstill, trusted
-from semslam.pipeline.cache import EntryIndex, table_files
+from semslam.pipeline.cache import EntryIndex
 from semslam.pipeline.console import table
-from semslam.pipeline.context import check_inputs
 from semslam.pipeline.files import TEMPORARY
 from semslam.pipeline.folder import OutputFolder
 from semslam.pipeline.record import LogRecord, load_records
+from semslam.pipeline.run_tables import log_tables
 from semslam.slam.verdict import OK
 from semslam.tables.parquet import TableFiles, write_table
 from semslam.tables.spec import EVALUATION, MOTION, OBSERVATIONS, POSES, TRUTH, Table
@@ -162,13 +162,8 @@ def _rows(
     folder: OutputFolder, index: EntryIndex, record: LogRecord, of: Table, variant: str, columns: Sequence[str]
 ) -> dict[str, list[Any]] | None:
     """Columns of a table of a log; None if the log does not have the table."""
-    task = record.tasks.get(f"{of.stage}/{variant}" if variant else of.stage)
-    entry = index.find(of.stage, task.key) if task and task.key else None
-    if entry is None or of.name not in entry.tables:
-        return None
-    files = table_files(folder.stage(of.stage) / entry.key)[of.name]
-    check_inputs(of.name, record.name, files)
-    return TableFiles(of, [Path(file.path) for file in files]).read(columns)
+    files = log_tables(folder, index, record, (of,), variant).get(of.name)
+    return None if files is None else TableFiles(of, files).read(columns)
 
 
 def _outdated(index: EntryIndex, record: LogRecord, estimator: str) -> bool:

@@ -84,7 +84,7 @@ class Thing:
     @property
     def middle(self) -> NDArray[np.float64]:
         """(2,) centroid of its footprint."""
-        return _centroid(self.footprint)
+        return centroid(self.footprint)
 
     @property
     def area_m2(self) -> float:
@@ -236,7 +236,7 @@ def _place(number: int) -> tuple[float, float]:
     return ((number - iy) >> 32) * CELL_M + 0.5 * CELL_M, iy * CELL_M + 0.5 * CELL_M
 
 
-def _centroid(outline: NDArray[np.float64]) -> NDArray[np.float64]:
+def centroid(outline: NDArray[np.float64]) -> NDArray[np.float64]:
     """(2,) of the area within an outline."""
     x, y = outline.T
     after_x, after_y = np.roll(x, -1), np.roll(y, -1)
