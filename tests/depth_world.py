@@ -37,19 +37,22 @@ class Room:
         middle = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
         rays = np.stack([(column - middle[0]) / FOCAL_PX, (row - middle[1]) / FOCAL_PX, np.ones_like(column)], -1)
         world_from_camera = world_from_robot @ ROBOT_FROM_CAMERA
-        depth = self._hit(world_from_camera[:3, 3], rays @ world_from_camera[:3, :3].T)
+        in_world = np.moveaxis(rays @ world_from_camera[:3, :3].T, -1, 0)
+        depth = self._hit(world_from_camera[:3, 3], np.ascontiguousarray(in_world))
         if noise is not None:
             depth = 1.0 / (1.0 / depth + 0.002 * noise.standard_normal(depth.shape))
         picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
         return View(picture, depth.astype(np.float32), FOCAL_PX, FOCAL_PX, *middle, ROBOT_FROM_CAMERA)
 
     def _hit(self, origin: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(H, W) lengths, in units of the rays, to the nearest surface: the far side of the room, the near of a box."""
+        """(H, W) lengths, in units of the rays (3, H, W), to the nearest surface: the far side of the room, the near of
+        a box."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            depth = np.maximum((self.lower - origin) / rays, (self.upper - origin) / rays).min(-1)
-            for low, high in self.boxes:
-                first, second = (low - origin) / rays, (high - origin) / rays
-                enter, leave = np.minimum(first, second).max(-1), np.maximum(first, second).min(-1)
+            walls = ((corner - origin)[:, None, None] / rays for corner in (self.lower, self.upper))
+            depth = np.maximum(*walls).min(0)
+            for box in self.boxes:
+                first, second = ((corner - origin)[:, None, None] / rays for corner in box)
+                enter, leave = np.minimum(first, second).max(0), np.maximum(first, second).min(0)
                 depth = np.where((enter < leave) & (enter > 0.05), np.minimum(depth, enter), depth)
         return np.asarray(depth)
 

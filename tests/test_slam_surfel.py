@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -48,11 +50,15 @@ GRID = Grid(CLASSES, CELL_M, SIDE)
 BIAS = SE2(0.02, -0.02, 0.01)
 
 
-def track(steps: list[Step], config: SurfelConfig = CONFIG) -> list[PoseEstimate]:
+def walked(steps: Iterable[Step], config: SurfelConfig = CONFIG) -> SurfelEstimator:
     estimator = SurfelEstimator(config, GRID)
     for step in steps:
         estimator.step(step)
-    return estimator.finish()
+    return estimator
+
+
+def track(steps: Iterable[Step]) -> list[PoseEstimate]:
+    return walked(steps).finish()
 
 
 def errors(found: list[PoseEstimate], drive: list[SE2]) -> tuple[float, float]:
@@ -210,10 +216,12 @@ def test_a_drive_is_found_to_the_centimetre() -> None:
 
 def test_smoothing_makes_it_better() -> None:
     """All keyframes together know more than each did when it came."""
-    drive = make_drive()
-    steps = make_views(make_room(3), drive, bias=BIAS, noise_m=0.03, noise_rad=0.03)
-    walked, smoothed = (errors(track(steps, replace(CONFIG, rounds=rounds)), drive)[0] for rounds in (0, 10))
-    assert smoothed < walked
+    drive = make_drive(18)
+    estimator = walked(make_views(make_room(3), drive, bias=BIAS, noise_m=0.03, noise_rad=0.03))
+    plain = SurfelEstimator(replace(CONFIG, rounds=0), GRID)
+    plain.restore([estimator.part()])
+    before, smoothed = (errors(one.finish(), drive)[0] for one in (plain, estimator))
+    assert smoothed < before
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -232,7 +240,7 @@ def test_without_motion_depth_will_do(seed: int) -> None:
 @pytest.mark.parametrize("seconds", [60, 600])
 def test_a_parked_robot_is_found_where_it_was(seconds: int, at: int) -> None:
     """Through a pause the odometry of a robot with a steady error rests; much or little may come after it."""
-    drive = make_drive(15)
+    drive = make_drive(12)
     steps = observed(make_views(make_room(), drive, bias=BIAS, noise_m=0.01))
     for index in range(at, len(steps)):
         steps[index] = replace(steps[index], stamp_nanos=steps[index].stamp_nanos + seconds * SECOND)
@@ -303,13 +311,10 @@ def test_a_place_without_overlap_begins_anew() -> None:
     steps = make_views(here, drive, noise_m=0.01)
     for index in (2, 3):
         steps[index] = replace(steps[index], view=hall.view(matrix(drive[index])))
-    found = track(steps)
+    estimator = walked(steps)
+    found = estimator.finish()
     assert [one.source for one in found[1:]] == ["visual", *["inertial"] * 2, *["visual"] * 4]
     assert errors(found[:2] + found[4:], drive[:2] + drive[4:])[0] < 0.03
-    estimator = SurfelEstimator(CONFIG, GRID)
-    for step in steps:
-        estimator.step(step)
-    estimator.finish()
     assert [row["frame"][0] for row in estimator.rows()] == [0, 1, 4, 5, 6, 7]
     assert next(estimator.warnings()).startswith("2 keyframes show nothing that the others do")
 
@@ -367,22 +372,36 @@ def test_doubt_grows_where_motion_alone_leads() -> None:
     assert [verdict_of(found[index], 0.1, 0.035) for index in (6, 7, 8, 9)] == [OK, UNCERTAIN, UNCERTAIN, OK]
 
 
-def carried(room: Room, other: Room, *, motion: SE2 | None) -> tuple[list[Step], list[SE2]]:
-    """A robot that drives, is carried off, and drives on; its odometry tells something of that, or nothing."""
-    drive = make_drive(12)
-    away = [SE2(1.2, -0.8, 2.4) @ pose for pose in make_drive(14)]
-    first, second = observed(make_views(room, drive)), observed(make_views(other, away))
-    later = [replace(step, frame=12 + step.frame, stamp_nanos=step.stamp_nanos + 60 * SECOND) for step in second]
-    return [*first, replace(later[0], motion=motion), *later[1:]], [*drive, *away]
+RESTING = SE2(0.0, 0.0, 0.0)
+"""What wheels tell of a robot that was carried."""
+BEFORE = AFTER = 8
+"""Keyframes before a robot was carried, and after."""
 
 
-@pytest.mark.parametrize("motion", [None, SE2(0.0, 0.0, 0.0)], ids=["without motion", "wheels at rest"])
+@lru_cache
+def carried(room: int, motion: SE2 | None) -> tuple[tuple[Step, ...], list[SE2]]:
+    """A robot that drives, is carried off into the room of that seed, 0 for the same one, and drives on; its odometry
+    tells something of that, or nothing."""
+    drive = make_drive(BEFORE)
+    away = [SE2(1.2, -0.8, 2.4) @ pose for pose in make_drive(AFTER)]
+    first, second = observed(make_views(make_room(), drive)), observed(make_views(make_room(room), away))
+    later = [replace(step, frame=BEFORE + step.frame, stamp_nanos=step.stamp_nanos + 60 * SECOND) for step in second]
+    return (*first, replace(later[0], motion=motion), *later[1:]), [*drive, *away]
+
+
+@lru_cache
+def carried_track(room: int, motion: SE2 | None) -> tuple[list[PoseEstimate], SurfelEstimator]:
+    """The finished track of that robot, for several tests."""
+    estimator = walked(carried(room, motion)[0])
+    return estimator.finish(), estimator
+
+
+@pytest.mark.parametrize("motion", [None, RESTING], ids=["without motion", "wheels at rest"])
 def test_a_robot_that_was_carried_is_found_by_its_map(motion: SE2 | None) -> None:
     """Whatever the odometry says of it."""
-    steps, drive = carried(make_room(), make_room(), motion=motion)
-    found = track(steps)
+    (found, _), (_, drive) = carried_track(0, motion), carried(0, motion)
     right = [one for one, true in zip(found, drive, strict=True) if one.map_from_robot and _near(one, true)]
-    assert len(right) >= 24
+    assert len(right) >= BEFORE + AFTER - 2
     for one, true in zip(found, drive, strict=True):
         assert verdict_of(one, 0.1, 0.035) != OK or _near(one, true)
 
@@ -393,32 +412,38 @@ def _near(estimate: PoseEstimate, true: SE2) -> bool:
     return math.hypot(apart.x_m, apart.y_m) < 0.05 and abs(apart.heading_rad) < 0.02
 
 
-@pytest.mark.parametrize("motion", [None, SE2(0.0, 0.0, 0.0)], ids=["without motion", "wheels at rest"])
+@pytest.mark.parametrize("motion", [None, RESTING], ids=["without motion", "wheels at rest"])
 def test_a_robot_that_was_carried_to_another_room_is_not_found_in_the_first(motion: SE2 | None) -> None:
     """Its poses are called uncertain, or there are none."""
-    steps, drive = carried(make_room(), make_room(5), motion=motion)
-    found = track(steps)
-    assert all(_near(one, true) for one, true in zip(found[:12], drive[:12], strict=True))
-    assert {verdict_of(one, 0.1, 0.035) for one in found[12:]}.isdisjoint({OK})
+    (found, _), (_, drive) = carried_track(5, motion), carried(5, motion)
+    assert all(_near(one, true) for one, true in zip(found[:BEFORE], drive[:BEFORE], strict=True))
+    assert {verdict_of(one, 0.1, 0.035) for one in found[BEFORE:]}.isdisjoint({OK})
 
 
 @pytest.mark.parametrize("kind", ["blind", "carried"])
 def test_parts_hold_everything(kind: str) -> None:
     """A track put away and taken up twice ends with the very numbers of one that was not."""
     if kind == "blind":
-        steps, cuts = make_views(make_room(), make_drive(9), bias=BIAS, noise_m=0.02, noise_rad=0.02), (0, 4, 7, 9)
+        steps, cuts = (
+            observed(make_views(make_room(), make_drive(9), bias=BIAS, noise_m=0.02, noise_rad=0.02)),
+            (0, 4, 7, 9),
+        )
         steps[3], steps[7] = replace(steps[3], view=None), replace(steps[7], motion=None)
+        estimator = walked(steps)
+        whole = estimator.finish()
     else:
-        steps, cuts = carried(make_room(), make_room(), motion=SE2(0.0, 0.0, 0.0))[0], (0, 12, 13, 26)
-    whole, parts = track(steps), list[bytes]()
-    estimator = SurfelEstimator(CONFIG, GRID)
+        steps, cuts = list(carried(5, RESTING)[0]), (0, BEFORE, BEFORE + 1, BEFORE + AFTER)
+        whole, estimator = carried_track(5, RESTING)
+    again, parts = SurfelEstimator(CONFIG, GRID), list[bytes]()
     for start, stop in pairwise(cuts):
         for step in steps[start:stop]:
-            estimator.step(step)
-        parts.append(estimator.part())
-        estimator = SurfelEstimator(CONFIG, GRID)
-        estimator.restore(parts)
-    assert estimator.finish() == whole
+            again.step(step)
+        parts.append(again.part())
+        again = SurfelEstimator(CONFIG, GRID)
+        again.restore(parts)
+    assert again.finish() == whole
+    for row, wanted in zip(again.rows(), estimator.rows(), strict=True):
+        np.testing.assert_equal(row, wanted)
 
 
 def test_a_robot_that_errs_more_than_it_is_said_to_is_found_out() -> None:
@@ -560,11 +585,10 @@ def test_a_single_keyframe_is_found(known: Path) -> None:
     assert math.hypot(apart.x_m, apart.y_m) < 0.03
 
 
-def test_a_map_comes_back_from_its_file(tmp_path: Path) -> None:
+def test_a_map_comes_back_from_its_file(known: Path) -> None:
     """The same places and the same cells; a log is found in its own map where it is."""
-    room, drive = make_room(5), make_drive(6)
-    prior = read_prior(make_map(tmp_path, room, drive), GRID)
-    assert len(prior.places) == 6
+    prior = read_prior(known, GRID)
+    assert len(prior.places) == 12
     assert len(prior.cells.points) > 500
     placement = place_in(prior, prior)
     assert placement.verdict == FOUND
@@ -598,7 +622,7 @@ def make_context(folder: Path, shard_frames: int) -> MemoryContext:
     inputs = write_inputs(folder, observed)
     write_table(folder / "frames.parquet", FRAMES, frame_rows(steps))
     inputs[FRAMES.name] = TableFiles(FRAMES, [folder / "frames.parquet"])
-    config = LocalizeConfig(estimators=("surfel",), shard_frames=shard_frames, snapshot_every=3)
+    config = LocalizeConfig(estimators=("surfel",), surfel=CONFIG, shard_frames=shard_frames, snapshot_every=3)
     return MemoryContext(folder / "out", inputs, config, "surfel")
 
 
@@ -614,37 +638,40 @@ def frame_rows(steps: list[Step]) -> dict[str, list[object]]:
     return {**rows, **pictures, "depth": [encode_depth(view.depth_m) for view in views]}
 
 
-def test_the_stage_tells_all_at_the_end(tmp_path: Path) -> None:
-    """All rows lie in the last shard, in the order of the keyframes, with the map along them."""
-    context = make_context(tmp_path / "a", shard_frames=3)
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> MemoryContext:
+    """A run of the stage in three shards."""
+    context = make_context(tmp_path_factory.mktemp("stage") / "whole", shard_frames=3)
     localize.run(context)
+    return context
+
+
+def test_the_stage_tells_all_at_the_end(finished: MemoryContext) -> None:
+    """All rows lie in the last shard, in the order of the keyframes, with the map along them."""
+    context, out = finished, finished.folder
     tables = context.results(POSES, SNAPSHOTS, CELLS)
     poses = tables["poses"].read()
     assert poses["frame"] == list(range(7))
     assert poses["source"] == ["start", *["visual"] * 6]
     assert tables["snapshots"].read()["frame"] == [2, 5, 6]
     assert tables["cells"].rows > 100
-    places = TableFiles(PLACES, [tmp_path / "a" / "out" / f"shard-{index}" / "places.parquet" for index in range(3)])
+    places = TableFiles(PLACES, [out / f"shard-{index}" / "places.parquet" for index in range(3)])
     assert places.read(["frame"])["frame"] == list(range(7))
     assert places.meta["side"] == SIDE
     assert tables["poses"].meta["estimator"] == "surfel"
-    rows = [TableFiles(POSES, [tmp_path / "a" / "out" / f"shard-{index}" / "poses.parquet"]).rows for index in range(3)]
+    rows = [TableFiles(POSES, [out / f"shard-{index}" / "poses.parquet"]).rows for index in range(3)]
     assert rows == [0, 0, 7]
     assert context.done[-1][0] == context.done[-1][1]
     assert context.shards[-1].counters == {"poses_start": 1, "poses_visual": 6}
 
 
-def test_a_run_that_was_cut_goes_on_with_the_same_bytes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("shards", [1, 2])
+def test_a_run_that_was_cut_goes_on_with_the_same_bytes(finished: MemoryContext, tmp_path: Path, shards: int) -> None:
     """From any finished shard."""
-    whole = make_context(tmp_path / "whole", shard_frames=3)
-    localize.run(whole)
-    for finished in (1, 2):
-        cut = make_context(tmp_path / f"cut{finished}", shard_frames=3)
-        shards = [tmp_path / "whole" / "out" / f"shard-{index}" for index in range(finished)]
-        cut.finished = tuple(FinishedShard(index, {}, {}, folder) for index, folder in enumerate(shards))
-        localize.run(cut)
-        for index in range(finished, 3):
-            ours, theirs = (tmp_path / name / "out" / f"shard-{index}" for name in (f"cut{finished}", "whole"))
-            assert {p.name: p.read_bytes() for p in ours.iterdir()} == {
-                p.name: p.read_bytes() for p in theirs.iterdir()
-            }
+    cut = make_context(tmp_path / "cut", shard_frames=3)
+    folders = [finished.folder / f"shard-{index}" for index in range(shards)]
+    cut.finished = tuple(FinishedShard(index, {}, {}, folder) for index, folder in enumerate(folders))
+    localize.run(cut)
+    for index in range(shards, 3):
+        ours, theirs = (folder / f"shard-{index}" for folder in (cut.folder, finished.folder))
+        assert {p.name: p.read_bytes() for p in ours.iterdir()} == {p.name: p.read_bytes() for p in theirs.iterdir()}
