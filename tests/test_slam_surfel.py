@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from semslam.errors import SemslamError
 from semslam.geometry.frames import FLU_FROM_OPTICAL, SE2
+from semslam.slam.checkpoint import unpack
 from semslam.slam.estimator import PoseEstimate, Step, View
 from semslam.slam.surfel.alignment import Target, change_between, nudged
 from semslam.slam.surfel.estimator import SurfelEstimator
@@ -441,6 +442,9 @@ def test_parts_hold_everything(kind: str) -> None:
         parts.append(again.part())
         again = SurfelEstimator(CONFIG, GRID)
         again.restore(parts)
+        put_away, taken_up = unpack(parts[-1]), unpack(again.part())
+        for name in ("bias", "covariance", "speed", "surprise", "open", "group"):
+            np.testing.assert_array_equal(taken_up[name], put_away[name], name)
     assert again.finish() == whole
     for row, wanted in zip(again.rows(), estimator.rows(), strict=True):
         np.testing.assert_equal(row, wanted)
