@@ -9,6 +9,9 @@ function takes a `mask` (rows, columns) of the cells that count; None counts all
     calibration_error  Naeini et al., AAAI 2015; Guo et al., On calibration of modern neural networks, ICML 2017
     class_overlaps     intersection and union of each class (Jaccard; Everingham et al., PASCAL VOC)
     boundary_f1        Csurka et al., What is a good evaluation measure for semantic segmentation?, BMVC 2013
+
+Where a map tells no planes but one class a cell and how sure it is of it, `reliability` judges that. Its counts, those
+of `class_overlaps` and those of `class_boundaries` add over maps before anything is divided.
 """
 
 from __future__ import annotations
@@ -53,6 +56,60 @@ class Overlaps:
         return _mean(self.iou[FIRST_OBJECT:])
 
 
+@dataclass(frozen=True, eq=False)
+class Boundaries:
+    """Boundary cells of each class in both maps, and how many of them the other map has nearby; (L,) each."""
+
+    found: NDArray[np.int64]
+    found_near: NDArray[np.int64]
+    """Of those found, with a true one nearby."""
+    true: NDArray[np.int64]
+    true_near: NDArray[np.int64]
+    """Of the true ones, with one found nearby."""
+
+    def __add__(self, other: Boundaries) -> Boundaries:
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Boundaries(*(one + another for one, another in pairs))
+
+    @property
+    def f1(self) -> NDArray[np.float64]:
+        """(L,) harmonic mean of precision and recall; 0 for classes in one map only, NaN for those in neither."""
+        precision, recall = self.found_near / np.maximum(self.found, 1), self.true_near / np.maximum(self.true, 1)
+        both = precision + recall
+        f1 = 2 * precision * recall / np.where(both > 0, both, 1.0)
+        return np.where((self.found > 0) | (self.true > 0), f1, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """How often cells are right, by how sure the map is of their class: equal bins (low, high] of 0 to 1."""
+
+    cells: NDArray[np.int64]
+    """(bins,)"""
+    confidence: NDArray[np.float64]
+    """(bins,) sum of their probabilities."""
+    right: NDArray[np.int64]
+    """(bins,) how many have their true class."""
+    squares: float
+    """Sum of (probability - right or not)^2."""
+
+    def __add__(self, other: Reliability) -> Reliability:
+        cells, confidence = self.cells + other.cells, self.confidence + other.confidence
+        return Reliability(cells, confidence, self.right + other.right, self.squares + other.squares)
+
+    @property
+    def error(self) -> float:
+        """Expected calibration error: |accuracy - confidence| of the bins, weighted by their cells."""
+        total = int(self.cells.sum())
+        return float(np.abs(self.right - self.confidence).sum() / total) if total else math.nan
+
+    @property
+    def brier(self) -> float:
+        """Mean squared error of the probability that the cell's class is right, 0 to 1."""
+        total = int(self.cells.sum())
+        return self.squares / total if total else math.nan
+
+
 @dataclass(frozen=True)
 class MapScore:
     """All scores of one map."""
@@ -94,14 +151,22 @@ def brier_score(belief: NDArray[Any], truth: Ids, mask: Mask | None = None) -> f
 def calibration_error(belief: NDArray[Any], truth: Ids, mask: Mask | None = None, bins: int = _BINS) -> float:
     """Expected calibration error: |accuracy - confidence| in equal bins of confidence, weighted by their cells."""
     probabilities = as_probabilities(belief)
+    return reliability(labels_of(belief), probabilities.max(0), truth, mask, bins).error
+
+
+def reliability(
+    found: Ids, probability: NDArray[Any], truth: Ids, mask: Mask | None = None, bins: int = _BINS
+) -> Reliability:
+    """Of a label map and the probability of each cell's class, both (rows, columns)."""
     kept = _kept(mask, truth)
-    confidence = probabilities.max(0)[kept]
-    right = (labels_of(belief) == truth)[kept]
-    if not confidence.size:
-        return math.nan
+    confidence, right = probability[kept].astype(np.float64), (found == truth)[kept]
     place = np.clip(np.ceil(confidence * bins).astype(np.int64) - 1, 0, bins - 1)  # bins are (low, high]
-    gap = np.bincount(place, right.astype(np.float64) - confidence, bins)
-    return float(np.abs(gap).sum() / confidence.size)
+    return Reliability(
+        np.bincount(place, minlength=bins),
+        np.bincount(place, confidence, bins),
+        np.bincount(place[right], minlength=bins),
+        float(((confidence - right) ** 2).sum()),
+    )
 
 
 def class_overlaps(found: Ids, truth: Ids, classes: int, mask: Mask | None = None) -> Overlaps:
@@ -119,9 +184,16 @@ def boundary_f1(found: Ids, truth: Ids, classes: int, mask: Mask | None = None, 
     A boundary cell belongs to the class and has a neighbour (of four) that does not; beyond the map nothing does. It is
     found if the other map has a boundary cell of the class at most `tolerance_cells` away, diagonals counting one.
     """
+    return _mean(class_boundaries(found, truth, classes, mask, tolerance_cells).f1[FIRST_OBJECT:])
+
+
+def class_boundaries(
+    found: Ids, truth: Ids, classes: int, mask: Mask | None = None, tolerance_cells: int = 1
+) -> Boundaries:
+    """What `boundary_f1` divides, of every class."""
     kept = _kept(mask, truth)
-    scores = [_boundary_f1(found == c, truth == c, kept, tolerance_cells) for c in range(FIRST_OBJECT, classes)]
-    return _mean(np.array(scores, np.float64))
+    counts = [_boundary_counts(found == c, truth == c, kept, tolerance_cells) for c in range(classes)]
+    return Boundaries(*np.array(counts, np.int64).reshape(classes, 4).T)
 
 
 def labels_of(belief: NDArray[Any]) -> Ids:
@@ -148,20 +220,12 @@ def _squares(belief: NDArray[Any], truth: Ids, mask: Mask | None) -> NDArray[np.
     return np.asarray(difference[:, _kept(mask, truth)] ** 2)
 
 
-def _boundary_f1(one: Mask, other: Mask, kept: Mask, tolerance: int) -> float:
-    """F1 of the boundaries of two regions; NaN if neither has any cell that counts."""
+def _boundary_counts(one: Mask, other: Mask, kept: Mask, tolerance: int) -> tuple[int, int, int, int]:
+    """Boundary cells of a region that count and how many of them are near the other's, and the same of the other."""
     edge, other_edge = _boundary(one), _boundary(other)
     near, other_near = _grown(edge, tolerance), _grown(other_edge, tolerance)
     edge, other_edge = edge & kept, other_edge & kept
-    if not edge.any() and not other_edge.any():
-        return math.nan
-    if not edge.any() or not other_edge.any():
-        return 0.0
-    precision, recall = (
-        float((edge & other_near).sum() / edge.sum()),
-        float((other_edge & near).sum() / other_edge.sum()),
-    )
-    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+    return int(edge.sum()), int((edge & other_near).sum()), int(other_edge.sum()), int((other_edge & near).sum())
 
 
 def _boundary(region: Mask) -> Mask:

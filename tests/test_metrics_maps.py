@@ -14,9 +14,11 @@ from semslam.map_metrics import (
     boundary_f1,
     brier_score,
     calibration_error,
+    class_boundaries,
     class_overlaps,
     labels_of,
     map_mse,
+    reliability,
     score_map,
 )
 
@@ -124,3 +126,37 @@ def test_a_missed_object_has_no_boundary() -> None:
     missed = room()
     missed[missed == TABLE] = FREE_FLOOR
     assert boundary_f1(missed, room(), CLASSES) == pytest.approx(0.5)
+
+
+def test_boundaries_of_every_class_add_up_before_dividing() -> None:
+    """A table half as long in one of two maps: its boundary is right as far as it goes, and the far end is missed."""
+    truth, short = room(), room()
+    short[6:8, 7:9] = FREE_FLOOR
+    one = class_boundaries(short, truth, CLASSES)
+    counts = [counts[TABLE] for counts in (one.found, one.found_near, one.true, one.true_near)]
+    assert counts == [4, 4, 8, 6]
+    assert one.f1[TABLE] == pytest.approx(2 * 1.0 * 0.75 / 1.75)
+    both = one + class_boundaries(truth, truth, CLASSES)
+    assert both.f1[TABLE] == pytest.approx(2 * 1.0 * (14 / 16) / (1 + 14 / 16))
+    assert class_boundaries(short, truth, CLASSES, tolerance_cells=2).f1[TABLE] == 1.0
+
+
+def test_a_class_of_one_map_alone_has_a_boundary_score_of_zero() -> None:
+    """And one of neither has none."""
+    floor = np.full((12, 12), FREE_FLOOR, np.int64)
+    f1 = class_boundaries(floor, room(), CLASSES).f1
+    assert f1[CHAIR] == 0.0
+    assert math.isnan(class_boundaries(floor, floor, CLASSES).f1[CHAIR])
+
+
+def test_reliability_by_hand() -> None:
+    """Two cells 0.85 sure and right, one 0.75 sure and wrong, one masked out; a second map doubles everything."""
+    found, truth = np.full((1, 4), CHAIR, np.int64), np.array([[CHAIR, CHAIR, TABLE, TABLE]], np.int64)
+    probability, mask = np.array([[0.85, 0.85, 0.75, 1.0]]), np.array([[True, True, True, False]])
+    one = reliability(found, probability, truth, mask, bins=10)
+    assert one.cells.tolist() == [0] * 7 + [1, 2, 0]
+    assert one.right.tolist() == [0] * 8 + [2, 0]
+    assert one.error == pytest.approx((0.75 + 0.3) / 3)
+    assert one.brier == pytest.approx((0.75**2 + 2 * 0.15**2) / 3)
+    assert (one + one).error == pytest.approx(one.error)
+    assert math.isnan(reliability(found, probability, truth, np.zeros_like(mask)).error)
