@@ -163,7 +163,7 @@ def reliability(
     place = np.clip(np.ceil(confidence * bins).astype(np.int64) - 1, 0, bins - 1)  # bins are (low, high]
     return Reliability(
         np.bincount(place, minlength=bins),
-        np.bincount(place, confidence, bins),
+        np.asarray(np.bincount(place, confidence, bins), np.float64),
         np.bincount(place[right], minlength=bins),
         float(((confidence - right) ** 2).sum()),
     )

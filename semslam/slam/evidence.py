@@ -10,22 +10,19 @@ of an instance is spill of the mask onto the background; within a blob, cells be
 edge.
 
 **What the keyframes together say.** A sight from distance d weighs w = 1 / (1 + (d / 3 m)^2), because depth, mask and
-heading errors grow with it. With E the summed weights of each class in a cell, and s = 2 for objects, 1 for obstacle
-and free floor,
+heading errors grow with it; E sums the weights of each class in a cell. What a cell is, and how surely, follows from
+these sums and from the things around it: belief.py. A tile is read again only if it or one beside it has changed.
 
-    probability(class) = s E(class) / (1 + sum over classes of s E)
-
-and the most probable class is the cell's. Objects count twice because a detector that overlooks a chair reports
-obstacle or floor in its place, while an object where there is none needs a false alarm: a chair seen in 4 of 10 views
-stays a chair, one seen in 3 of 10 does not. The 1 in the sum is doubt: a single near sight makes 0.67 (object) or 0.5
-(floor).
+Two maps are compared by what was seen, not by what they make of it: there a cell is of the class of the largest E,
+which counts twice for objects, because a detector that overlooks a chair reports obstacle or floor in its place.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 import cv2
@@ -34,7 +31,8 @@ from numpy.typing import NDArray
 
 from semslam.geometry.frames import SE2
 from semslam.geometry.grid import Planes
-from semslam.labels import FIRST_OBJECT, FREE_FLOOR, OBSTACLE
+from semslam.labels import FIRST_OBJECT, FREE_FLOOR, OBSTACLE, UNOBSERVED
+from semslam.slam.belief import Belief, Ids, hulls_of
 from semslam.slam.checkpoint import pack, unpack
 
 TILE = 64
@@ -53,6 +51,8 @@ SNAPSHOT_INDICES = 1 << 32
 
 _Mask = NDArray[np.bool_]
 _Columns = dict[str, NDArray[Any]]
+_Place = tuple[int, int]
+"""Row and column of a tile."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,11 @@ class Evidence:
         self._cell_m = cell_m
         self._side = side
         self._weight = _sight_weights(side, cell_m)
-        self._tiles: dict[tuple[int, int], _Tile] = {}
+        self._tiles: dict[_Place, _Tile] = {}
+        self._labels: dict[_Place, Ids] = {}
+        """Of each tile by itself: what has been read since it changed."""
+        self._columns: dict[_Place, _Columns] = {}
+        """The cells of each tile, likewise since it or one beside it changed."""
 
     def add(self, planes: Planes, map_from_robot: SE2, stamp_nanos: int) -> bool:
         """Lay one observation (L, side, side) on the map. False if the pose is too far away to be one."""
@@ -110,7 +114,8 @@ class Evidence:
         if seen.any():
             patch = self._patch(map_from_robot, seen)
             sights = {class_id: mask for class_id, mask in sightings(planes).items() if mask.any()}
-            for tile, window, part in self._tiles_under(patch):
+            for place, window, part in self._tiles_under(patch):
+                tile = self._changing(place)
                 _count(tile, window, patch.source[part], seen, sights, self._weight, stamp_nanos)
         return True
 
@@ -134,24 +139,49 @@ class Evidence:
         inside = (column >= 0) & (column < self._side) & (row >= 0) & (row < self._side)
         return _Patch(left, low, np.where(inside, row * self._side + column, self._side * self._side))
 
-    def _tiles_under(self, patch: _Patch) -> Iterator[tuple[_Tile, tuple[slice, slice], tuple[slice, slice]]]:
-        """Tiles that the patch touches, with the window of the tile and the part of the patch that meet."""
+    def _tiles_under(self, patch: _Patch) -> Iterator[tuple[_Place, tuple[slice, slice], tuple[slice, slice]]]:
+        """Places of tiles that the patch touches, with the window of the tile and the part of the patch that meet."""
         rows, columns = patch.source.shape
         for tile_y in range(patch.low // TILE, (patch.low + rows - 1) // TILE + 1):
             for tile_x in range(patch.left // TILE, (patch.left + columns - 1) // TILE + 1):
                 window_y, part_y = _overlap(tile_y * TILE, patch.low, rows)
                 window_x, part_x = _overlap(tile_x * TILE, patch.left, columns)
                 if (patch.source[part_y, part_x] < self._side**2).any():
-                    tile = self._tiles.setdefault((tile_y, tile_x), _Tile())
-                    yield tile, (window_y, window_x), (part_y, part_x)
+                    yield (tile_y, tile_x), (window_y, window_x), (part_y, part_x)
+
+    def _changing(self, place: _Place) -> _Tile:
+        """The tile there, to be changed: what was read of it, and of those beside it, is forgotten."""
+        self._labels.pop(place, None)
+        for beside in _around(place):
+            self._columns.pop(beside, None)
+        return self._tiles.setdefault(place, _Tile())
 
     def cells(self) -> _Columns:
         """Columns ix, iy, class_id, probability, hits, views, first_seen_nanos, last_seen_nanos; by iy, then ix."""
-        parts = [_tile_cells(tile_y, tile_x, tile) for (tile_y, tile_x), tile in sorted(self._tiles.items())]
-        parts = parts or [_tile_cells(0, 0, _Tile())]
-        whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        order = np.lexsort((whole["ix"], whole["iy"]))
-        return {name: column[order] for name, column in whole.items()}
+        parts = [self._cells_of(place) for place in sorted(self._tiles)]
+        return _joined(parts or [_tile_cells((0, 0), _Tile(), _belief(_Tile()))])
+
+    def seen(self) -> _Columns:
+        """Columns ix, iy, class_id of what was seen most, to be compared with another map; by iy, then ix."""
+        parts = [_tile_seen(place, tile) for place, tile in sorted(self._tiles.items())]
+        return _joined(parts or [_tile_seen((0, 0), _Tile())])
+
+    def _cells_of(self, place: _Place) -> _Columns:
+        """The cells of a tile, with what the things that reach into it say."""
+        if place not in self._columns:
+            inner = slice(TILE, 2 * TILE)
+            labels = np.block([[self._labels_of(beside) for beside in row] for row in _rows_around(place)])
+            belief = _belief(self._tiles[place]).enclosed(hulls_of(labels, (inner, inner), TILE))
+            self._columns[place] = _tile_cells(place, self._tiles[place], belief)
+        return self._columns[place]
+
+    def _labels_of(self, place: _Place) -> Ids:
+        """The most probable class of each cell of a tile by itself; *unobserved* where no tile is."""
+        if place not in self._tiles:
+            return np.full((TILE, TILE), UNOBSERVED, np.uint16)
+        if place not in self._labels:
+            self._labels[place] = _belief(self._tiles[place]).labels()
+        return self._labels[place]
 
     def snapshot(self, around: SE2) -> Snapshot:
         """The map as it stands, at most `SNAPSHOT_HALF` cells either way of a pose; empty about one off the map."""
@@ -185,7 +215,7 @@ class Evidence:
 
     def restore(self, state: bytes) -> None:
         """Go on from `state`."""
-        self._tiles = {}
+        self._tiles, self._labels, self._columns = {}, {}, {}
         for name, array in unpack(state).items():
             tile_y, tile_x, kind, *class_id = name.split(",")
             tile = self._tiles.setdefault((int(tile_y), int(tile_x)), _Tile())
@@ -253,24 +283,54 @@ def _count(
             tile.weights.setdefault(class_id, np.zeros((TILE, TILE), np.float32))[window] += hit * weight[source]
 
 
-def _tile_cells(tile_y: int, tile_x: int, tile: _Tile) -> _Columns:
-    """The cells of a tile in which anything was recognised. Of equal probabilities objects win, then obstacles."""
-    ids = [class_id for class_id in sorted(tile.hits) if class_id >= FIRST_OBJECT]
-    ids += [class_id for class_id in (OBSTACLE, FREE_FLOOR) if class_id in tile.hits]
-    shares = np.array([OBJECT_SHARE if class_id >= FIRST_OBJECT else 1.0 for class_id in ids], np.float32)
-    nothing = np.zeros((1, TILE, TILE), np.float32)
-    weights = np.stack([tile.weights[class_id] for class_id in ids]) * shares[:, None, None] if ids else nothing
-    hits = np.stack([tile.hits[class_id] for class_id in ids]) if ids else nothing.astype(np.uint32)
-    best = weights.argmax(0)
-    y, x = np.nonzero(weights.any(0))
-    top = best[y, x]
+def _rows_around(place: _Place) -> Iterator[list[_Place]]:
+    """Places of the tiles about one, and its own, row by row."""
+    for row in range(place[0] - 1, place[0] + 2):
+        yield [(row, column) for column in range(place[1] - 1, place[1] + 2)]
+
+
+def _around(place: _Place) -> Iterator[_Place]:
+    return chain.from_iterable(_rows_around(place))
+
+
+def _joined(parts: Sequence[_Columns]) -> _Columns:
+    """Cells of all tiles, by iy, then ix."""
+    whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    order = np.lexsort((whole["ix"], whole["iy"]))
+    return {name: column[order] for name, column in whole.items()}
+
+
+def _belief(tile: _Tile) -> Belief:
+    """What the sights in a tile say of its cells."""
+    return Belief.of(tile.weights, (TILE, TILE))
+
+
+def _tile_cells(place: _Place, tile: _Tile, belief: Belief) -> _Columns:
+    """The cells of a tile in which anything was recognised."""
+    labels, probability = belief.told()
+    y, x = np.nonzero(labels != UNOBSERVED)
+    hits = np.zeros((TILE, TILE), np.uint32)
+    for class_id, counts in tile.hits.items():
+        np.copyto(hits, counts, where=labels == class_id)
     return {
-        "ix": (tile_x * TILE + x).astype(np.int32),
-        "iy": (tile_y * TILE + y).astype(np.int32),
-        "class_id": np.array(ids or [0], np.uint16)[top],
-        "probability": weights[top, y, x] / (1 + weights.sum(0)[y, x]),
-        "hits": hits[top, y, x],
+        "ix": (place[1] * TILE + x).astype(np.int32),
+        "iy": (place[0] * TILE + y).astype(np.int32),
+        "class_id": labels[y, x],
+        "probability": probability[y, x],
+        "hits": hits[y, x],
         "views": tile.views[y, x],
         "first_seen_nanos": tile.first[y, x],
         "last_seen_nanos": tile.last[y, x],
     }
+
+
+def _tile_seen(place: _Place, tile: _Tile) -> _Columns:
+    """The cells of a tile in which anything was recognised. Of equal weights objects win, then obstacles."""
+    ids = [class_id for class_id in sorted(tile.weights) if class_id >= FIRST_OBJECT]
+    ids += [class_id for class_id in (OBSTACLE, FREE_FLOOR) if class_id in tile.weights]
+    shares = [OBJECT_SHARE if class_id >= FIRST_OBJECT else 1.0 for class_id in ids]
+    planes = [np.float32(share) * tile.weights[class_id] for share, class_id in zip(shares, ids, strict=True)]
+    weights = np.stack(planes or [np.zeros((TILE, TILE), np.float32)])
+    y, x = np.nonzero(weights.any(0))
+    ix, iy = (place[1] * TILE + x).astype(np.int32), (place[0] * TILE + y).astype(np.int32)
+    return {"ix": ix, "iy": iy, "class_id": np.array(ids or [0], np.uint16)[weights.argmax(0)[y, x]]}

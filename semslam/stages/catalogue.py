@@ -45,7 +45,7 @@ EXTRACT = Stage(
 )
 LOCALIZE = Stage(
     "localize",
-    version=3,
+    version=4,
     config=LocalizeConfig,
     reads=(FRAMES, MOTION, OBSERVATIONS),
     writes=(POSES, SNAPSHOTS, CELLS, PLACES),

@@ -254,7 +254,7 @@ CELLS = Table(
         _c("class_id", "uint16", "", "most probable class, an index into the class list"),
         _c("label", "string", "", "its name"),
         _c("probability", "float32", "", "probability of that class"),
-        _c("hits", "uint32", "", "keyframes that saw this class in the cell"),
+        _c("hits", "uint32", "", "keyframes that saw this class in the cell; 0 if only the hull of a thing holds it"),
         _c("views", "uint32", "", "keyframes that saw the cell at all"),
         _c("first_seen_nanos", "int64", "ns", "stamp of the first keyframe that saw the cell"),
         _c("last_seen_nanos", "int64", "ns", "stamp of the last keyframe that saw the cell"),

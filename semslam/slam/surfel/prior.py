@@ -64,13 +64,13 @@ class Grid:
 
 
 def submap_of(places: Sequence[Place], seen: Iterable[Seen], grid: Grid) -> Submap:
-    """Places with the semantic map that their observations make."""
+    """Places with what their observations saw where."""
     evidence = Evidence(grid.cell_m, grid.side)
     for place, one in zip(places, seen, strict=True):
         planes = grid.dense(one)
         if planes is not None:
             evidence.add(planes, planar(place.pose), 0)
-    return Submap(places, ClassMap.of(evidence.cells(), grid.cell_m, grid.classes))
+    return Submap(places, ClassMap.of(evidence.seen(), grid.cell_m, grid.classes))
 
 
 def place_row(frame: int, stamp_nanos: int, place: Place, seen: Seen) -> dict[str, list[Any]]:

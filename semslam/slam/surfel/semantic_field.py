@@ -47,7 +47,7 @@ class ClassMap:
 
     @staticmethod
     def of(cells: Mapping[str, NDArray[Any]], cell_m: float, classes: Sequence[str]) -> ClassMap:
-        """From the columns ix, iy and class_id of the cells table."""
+        """From columns ix, iy and class_id as evidence gives them."""
         points = (np.stack([cells["ix"], cells["iy"]], 1) + 0.5) * cell_m
         return ClassMap(np.asarray(points, np.float64), np.asarray(cells["class_id"], np.int64), cell_m, tuple(classes))
 
