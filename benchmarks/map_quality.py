@@ -110,11 +110,15 @@ class Score:
     right: int
     cells: int
     """That count."""
+    occupied: NDArray[np.int64]
+    """Cells with anything on them in both maps, in the one that is judged, in truth; true obstacles, and how many of
+    those are told to be free floor."""
 
     def __add__(self, other: Score) -> Score:
         boundaries = tuple(map(add, self.boundaries, other.boundaries))
         overlaps, told = self.overlaps + other.overlaps, self.reliability + other.reliability
-        return Score(overlaps, boundaries, told, self.right + other.right, self.cells + other.cells)
+        right, cells = self.right + other.right, self.cells + other.cells
+        return Score(overlaps, boundaries, told, right, cells, self.occupied + other.occupied)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,9 +217,17 @@ def scored(layers: Mapping[str, Layer], truth: Ids, mask: Mask, classes: int) ->
             reliability(layer.ids, layer.probability, truth, mask & (layer.ids != UNOBSERVED), BINS),
             int((layer.ids == truth)[mask].sum()),
             int(mask.sum()),
+            occupancy(layer.ids[mask], truth[mask]),
         )
         for kind, layer in layers.items()
     }
+
+
+def occupancy(found: Ids, truth: Ids) -> NDArray[np.int64]:
+    """As `Score` has it."""
+    told, true, walls = found >= OBSTACLE, truth >= OBSTACLE, truth == OBSTACLE
+    sets = (told & true, told, true, walls, walls & (found == FREE_FLOOR))
+    return np.array([np.count_nonzero(one) for one in sets], np.int64)
 
 
 # ------------------------------------------------------------------------------------------------------- cells as maps
@@ -340,6 +352,10 @@ def tell(title: str, scores: Scores, classes: Sequence[str]) -> None:
     print("|---|---|---|---|---|---|---|---|")
     for kind in kinds:
         print(summary(kind, scores[kind]))
+    print("\n| occupied: obstacle or object | precision | recall | obstacles called free floor |\n|---|---|---|---|")
+    for kind in kinds:
+        both, told, true, walls, missed = scores[kind].occupied.tolist()
+        print(f"| {kind} | {both / max(1, told):.3f} | {both / max(1, true):.3f} | {missed / max(1, walls):.3f} |")
     print("\n| IoU | " + " | ".join(kinds) + " |\n|---|" + "---|" * len(kinds))
     for number, name in list(enumerate(classes))[FREE_FLOOR:]:
         print(f"| {name} | " + " | ".join(f"{scores[kind].overlaps.iou[number]:.2f}" for kind in kinds) + " |")
