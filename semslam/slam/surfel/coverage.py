@@ -19,7 +19,7 @@ _FACES = 6
 """A surface counts by voxel and by the side that it turns to: the other side of a table is something else."""
 _OFTEN = 3
 """Keyframes that must show a surface ..."""
-_SHARE = 0.9
+_SHARE = 0.8
 """... and share of a keyframe's surfaces that must be shown so often for it to be left out."""
 
 
