@@ -27,11 +27,19 @@ _SHARED = 0.2
 """What a distance counts: those of neighbours err alike, since they come from the same pixels and surfaces."""
 
 
+_STEPS = np.stack(np.meshgrid(*3 * [[-1, 0, 1]], indexing="ij"), -1).reshape(-1, 3)
+"""(27, 3) steps from a voxel to itself and to those around it."""
+
+
 class Target:
     """Surfels that others can be aligned with."""
 
-    def __init__(self, surfels: Surfels) -> None:
+    def __init__(self, surfels: Surfels, farthest_m: float = 0.0) -> None:
+        """`farthest_m`: no fit will reach farther, and what is farther from all surfels is sorted out before the tree
+        is asked, which takes long for it: worth while for large maps and wrong guesses. 0 sorts nothing out; the fits
+        are the same either way."""
         self.surfels = surfels
+        self._farthest_m = farthest_m
 
     @cached_property
     def tree(self) -> Any:
@@ -40,10 +48,21 @@ class Target:
 
         return small_gicp.KdTree(self.surfels.points)
 
+    @cached_property
+    def _around(self) -> NDArray[np.int64]:
+        """Voxels within one of a surfel's, rising."""
+        own = np.unique(_cells(self.surfels.points, self._farthest_m), axis=0)
+        return np.unique(_numbers((own[:, None] + _STEPS).reshape(-1, 3)))
+
     def fit(self, moved: Surfels, reach_m: float) -> Fit:
         """Compare surfels, already moved into this frame, with the nearest ones up to `reach_m` away."""
         nothing = np.zeros((0, 3))
         if not len(moved) or not len(self.surfels):
+            return Fit(nothing, nothing, np.zeros(0), np.zeros(0))
+        if self._farthest_m:
+            inside = np.isin(_numbers(_cells(moved.points, self._farthest_m)), self._around)
+            moved = Surfels(moved.points[inside], moved.normals[inside], moved.sigma_m[inside])
+        if not len(moved):
             return Fit(nothing, nothing, np.zeros(0), np.zeros(0))
         found, squared = self.tree.batch_nearest_neighbor_search(moved.points)
         near = np.asarray(found, np.int64).ravel()
@@ -56,6 +75,17 @@ class Target:
         distance = np.einsum("ij,ij->i", normals, points - self.surfels.points[near])
         sigma = np.hypot(moved.sigma_m[source], self.surfels.sigma_m[near])
         return Fit(points, normals, distance, sigma)
+
+
+def _cells(points: Floats, side_m: float) -> NDArray[np.int64]:
+    """(N, 3) voxels in which points lie."""
+    return np.floor(points / side_m).astype(np.int64)
+
+
+def _numbers(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(N,) a number for each voxel; only beyond a million of them along an axis do some share one."""
+    shifted = cells + (1 << 20)
+    return np.asarray((shifted[:, 0] << 42) ^ (shifted[:, 1] << 21) ^ shifted[:, 2])
 
 
 @dataclass(frozen=True, eq=False)

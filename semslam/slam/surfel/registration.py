@@ -108,7 +108,7 @@ def place_in(own: Submap, other: Submap) -> Placement:
     if not asked or not known:
         return Placement(LOST)
     whole = Surfels.joined([place.keyframe.surfels.moved(place.pose) for place in known if place.keyframe])
-    target = Target(whole.every(max(1, len(whole) // _TARGET_SURFELS)))
+    target = Target(whole.every(max(1, len(whole) // _TARGET_SURFELS)), max(_REACHES_M))
     guesses = candidates(own.cells, other.cells, _PROPOSALS)
     worth = [guess for guess in guesses if guess.score >= _WORTH_A_LOOK * guesses[0].score]
     found = [_proposal(asked, known, target, guess) for guess in worth]
