@@ -424,6 +424,39 @@ def export(context: click.Context, /, **given: Any) -> int:
 
 @cli.command()
 @_out_argument
+@click.option("--log", "logs", multiple=True, metavar="NAME", help="Log of OUT; repeatable. Default: all.")
+@click.option("--into", type=click.Path(path_type=Path), help="Folder of the sites. Default: OUT/sites.")
+@_json_option
+@click.option("--quiet", is_flag=True, help="Only warnings and errors.")
+@click.pass_context
+def merge(
+    context: click.Context, out: Path, logs: tuple[str, ...], into: Path | None, as_json: bool, quiet: bool
+) -> None:
+    """Bring logs of one place into one map and one frame.
+
+    OUT is the folder of a finished run with the estimator surfel. Its logs are sorted into sites without a first guess;
+    all keyframes of a site are aligned with each other. A log that is lost or ambiguous stays a site of its own.
+
+    \b
+    Example:
+      semslam merge OUT --log monday --log tuesday --into maps
+    """
+    from semslam.pipeline.folder import open_folder
+    from semslam.pipeline.merge import MergeRequest, merge_run
+    from semslam.pipeline.merge_view import MergeView, say_merged
+
+    console = _console(quiet=quiet)
+    view = MergeView(console)
+    try:
+        report = merge_run(MergeRequest(open_folder(out), logs, into), _stages(context), view.progressed)
+    finally:
+        view.close()
+    say_merged(console, report)
+    _print(report, as_json)
+
+
+@cli.command()
+@_out_argument
 @_json_option
 def evaluate(out: Path, as_json: bool) -> None:
     """Compare all tracks with ground truth.

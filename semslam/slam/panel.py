@@ -117,7 +117,7 @@ def draw_panel(canvas: Canvas, view: View, cells: MapCells, path: Path, colours:
     raster = _rasterize(cells, view)
     _paint_cells(canvas, raster, cells.classes, colours, view)
     draw_axes(canvas, view)
-    taken = draw_path(canvas, path, view)
+    taken = [box for part in path.parts for box in draw_path(canvas, part, view)]
     _draw_labels(canvas, raster, cells.classes, view, taken)
     if not cells.ix.size:
         middle = view.x + view.width / 2, view.y + view.height / 2

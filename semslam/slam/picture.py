@@ -36,6 +36,14 @@ class Path:
 
     x_m: NDArray[np.float64]
     y_m: NDArray[np.float64]
+    starts: tuple[int, ...] = ()
+    """Keyframes at which the path of another log begins."""
+
+    @property
+    def parts(self) -> list[Path]:
+        """The path of each log by itself."""
+        pieces = zip(np.split(self.x_m, self.starts), np.split(self.y_m, self.starts), strict=True)
+        return [Path(x, y) for x, y in pieces]
 
     @property
     def posed(self) -> NDArray[np.float64]:
@@ -44,5 +52,5 @@ class Path:
 
     @property
     def length_m(self) -> float:
-        """From known position to known position."""
-        return float(np.hypot(*np.diff(self.posed, axis=0).T).sum())
+        """From known position to known position of one log."""
+        return float(sum(np.hypot(*np.diff(part.posed, axis=0).T).sum() for part in self.parts))

@@ -59,7 +59,7 @@ def run(ctx: StageContext) -> None:
     poses, cells = ctx.read(POSES), ctx.read(CELLS)
     track, rows = poses.read(_POSE), cells.read()
     shown, placed = _map_cells(rows, cells.meta), _placed(track)
-    path = Path(*(np.array(track[name], np.float64) for name in ("x_m", "y_m")))
+    path = Path(np.array(track["x_m"], np.float64), np.array(track["y_m"], np.float64))
     with ctx.shard(0) as shard:
         _write_trajectory(shard, track, poses)
         write_table(shard.path("map.parquet"), CELLS, rows, dict(cells.meta))

@@ -469,7 +469,38 @@ LAYERS = Table(
     ),
 )
 
+SITES = Table(
+    "sites",
+    19,
+    "merge",
+    (
+        _c("log", "string", "", "log name"),
+        _c("site", "string", "", "its site: the name of the site's first log, and of its folder"),
+        _c("verdict", "string", "", "first, found, ambiguous, lost or contradicted"),
+        _c("x_m", "float64", "m", "where the log's own map frame lies in the site's"),
+        _c("y_m", "float64", "m", "likewise"),
+        _c("heading_rad", "float64", "rad", "likewise, (-pi, pi]"),
+        _c(
+            "covariance",
+            "list<float64>",
+            "m, rad",
+            "3x3 matrix of that x, y and heading, row by row; empty if it is not known",
+        ),
+        _c("keyframes", "int32", "", "keyframes whose place pictures tell"),
+        _c("ties", "int32", "", "pairs that surfaces tie of its keyframes and those of other logs"),
+        _c("other", "string", "", "the log on whose site it was laid for the verdict; null if on none", null=True),
+        _c(
+            "likeness",
+            "float64",
+            "",
+            "log likelihood ratio of a sample there, right pose against wrong one; null if no pose was likely at all",
+            null=True,
+        ),
+        _c("probability", "float64", "", "of the best way to lie there among all ways; null likewise", null=True),
+    ),
+)
+
 ALL_TABLES: tuple[Table, ...] = (
     TOPICS, FRAMES, MOTION, TRUTH, DETECTIONS, OBSERVATIONS, POSES, SNAPSHOTS, CELLS, TRAJECTORY, EVALUATION,
-    SPLITS, TRUE_MAP, HOME_OBJECTS, VIEWS, PLACES, OBJECTS, LAYERS,
+    SPLITS, TRUE_MAP, HOME_OBJECTS, VIEWS, PLACES, OBJECTS, LAYERS, SITES,
 )  # fmt: skip

@@ -63,6 +63,16 @@ class Grid:
         return planes
 
 
+@dataclass(frozen=True, eq=False)
+class Remembered:
+    """A keyframe that a map knows: a row of the places table."""
+
+    frame: int
+    stamp_nanos: int
+    place: Place
+    seen: Seen
+
+
 def submap_of(places: Sequence[Place], seen: Iterable[Seen], grid: Grid) -> Submap:
     """Places with what their observations saw where."""
     evidence = Evidence(grid.cell_m, grid.side)
@@ -101,19 +111,26 @@ def read_prior(path: Path, grid: Grid) -> Submap:
     Raises:
         SemslamError: it is no such file, or its observations are of other classes or cells than `grid`.
     """
-    table = open_prior(path, grid)
-    places: list[Place] = []
-    seen: list[Seen] = []
+    with made_by(_COMMAND):
+        known = remembered(open_prior(path, grid), grid, f"map `{path}`")
+    return submap_of([one.place for one in known], [one.seen for one in known], grid)
+
+
+def remembered(table: TableFiles, grid: Grid, name: str) -> list[Remembered]:
+    """All keyframes of a places table, whose observations are of that grid; `name` is what messages call it.
+
+    Raises:
+        SemslamError: a row is no place.
+    """
+    known: list[Remembered] = []
     try:
-        with made_by(_COMMAND):
-            for row in rows_of(table.batches(batch_rows=8)):
-                places.append(_place(row))
-                seen.append(Seen(np.array(row["cells"], np.uint32), np.array(row["weights"], np.float32)))
-        return submap_of(places, seen, grid)
+        for row in rows_of(table.batches(batch_rows=8)):
+            known.append(_remembered(row, grid))
     except (ValueError, IndexError) as error:
         raise SemslamError(
-            f"Row {len(places)} of map `{path}` is no place: {error}", hint=f"make it again: `{_COMMAND}`"
+            f"Row {len(known)} of {name} is no place: {error}", hint=f"make it again: `{_COMMAND}`"
         ) from error
+    return known
 
 
 def open_prior(path: Path, grid: Grid) -> TableFiles:
@@ -140,6 +157,13 @@ def open_prior(path: Path, grid: Grid) -> TableFiles:
             hint="run both logs with the same detector and the same `[extract]`",
         )
     return table
+
+
+def _remembered(row: dict[str, Any], grid: Grid) -> Remembered:
+    seen = Seen(np.array(row["cells"], np.uint32), np.array(row["weights"], np.float32))
+    if len(seen.cells) != len(seen.weights) or (seen.cells >= len(grid.classes) * grid.side**2).any():
+        raise ValueError("its observation does not suit the classes and the side")
+    return Remembered(row["frame"], row["stamp_nanos"], _place(row), seen)
 
 
 def _place(row: dict[str, Any]) -> Place:

@@ -1,0 +1,121 @@
+"""The folder of a site: one map of all its logs, and the track of each in that map's frame.
+
+    SITE/                        named after the site's first log
+      places.parquet             table 16: a map for `--prior`
+      map.parquet                table 9
+      map.png, map.yaml, map.pgm
+      <log>/trajectory.parquet   table 10
+      <log>/trajectory.tum
+
+Written by the functions that `export` writes the same files of a single log with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semslam.slam.exchange import map_yaml, occupancy_image, pgm, tum, unknown_grey
+from semslam.slam.picture import MapCells
+from semslam.slam.picture import Path as DrawnPath
+from semslam.slam.render import render_map
+from semslam.slam.surfel.merging import Site
+from semslam.slam.surfel.prior import Grid, Remembered, place_row
+from semslam.slam.surfel.site_map import Pose, cells, remembered, thinned
+from semslam.stages.settings import ExportConfig
+from semslam.tables.parquet import TableFileWriter, write_table
+from semslam.tables.spec import CELLS, PLACES, TRAJECTORY
+
+
+@dataclass(frozen=True)
+class SiteStyle:
+    """How a site's files are made."""
+
+    estimator: str
+    grid: Grid
+    export: ExportConfig
+
+    @property
+    def meta(self) -> dict[str, Any]:
+        """Of the cells table."""
+        return {"classes": list(self.grid.classes), "cell_m": self.grid.cell_m, "estimator": self.estimator}
+
+
+def write_site(folder: Path, site: Site, tracks: Sequence[Sequence[Pose]], style: SiteStyle) -> bool:
+    """Write all files of a site into a new folder, `tracks` of its logs among them; False if the map is too large for
+    map_server and those two files were left out."""
+    folder.mkdir()
+    known = remembered(site)
+    _write_places(folder / "places.parquet", thinned(known), style)
+    columns = cells(known, style.grid)
+    write_table(folder / "map.parquet", CELLS, columns, style.meta)
+    shown = _map_cells(columns, style.grid)
+    for drive, track in zip(site.drives, tracks, strict=True):
+        (folder / drive.name).mkdir()
+        _write_track(folder / drive.name, track, style)
+    path = _drawn(tracks)
+    title, subtitle = _titles(site, shown, len(path.x_m), style)
+    (folder / "map.png").write_bytes(render_map(shown, path, title, subtitle, style.export.pixels_per_cell))
+    return _write_occupancy(folder, shown, style.export)
+
+
+def _write_places(path: Path, known: Sequence[Remembered], style: SiteStyle) -> None:
+    """Keyframes are numbered anew, since those of several logs have the same numbers."""
+    file = TableFileWriter(path, PLACES, {**style.meta, "side": style.grid.side})
+    try:
+        for number, one in enumerate(known):
+            file.append(place_row(number, one.stamp_nanos, one.place, one.seen))
+    finally:
+        file.close()
+
+
+def _write_track(folder: Path, track: Sequence[Pose], style: SiteStyle) -> None:
+    """As table and as TUM file."""
+    rows: dict[str, list[Any]] = {
+        "frame": [row.frame for row in track],
+        "stamp_nanos": [row.stamp_nanos for row in track],
+        "x_m": [row.pose.x_m for row in track],
+        "y_m": [row.pose.y_m for row in track],
+        "heading_rad": [row.pose.heading_rad for row in track],
+        "verdict": [row.verdict for row in track],
+    }
+    write_table(folder / "trajectory.parquet", TRAJECTORY, rows, {"estimator": style.estimator})
+    lines = tum((row.stamp_nanos, row.pose.x_m, row.pose.y_m, row.pose.heading_rad) for row in track)
+    (folder / "trajectory.tum").write_text(lines, encoding="ascii", newline="\n")
+
+
+def _write_occupancy(folder: Path, shown: MapCells, config: ExportConfig) -> bool:
+    """map.pgm and map.yaml; False if the map is too large for them."""
+    occupied, free = config.occupied_threshold, config.free_threshold
+    found = occupancy_image(shown, unknown_grey(free, occupied))
+    if found is None:
+        return False
+    image, corner = found
+    (folder / "map.pgm").write_bytes(pgm(image))
+    text = map_yaml("map.pgm", shown.cell_m, corner, occupied, free)
+    (folder / "map.yaml").write_text(text, encoding="ascii", newline="\n")
+    return True
+
+
+def _map_cells(columns: Mapping[str, Any], grid: Grid) -> MapCells:
+    ix, iy, class_id = (np.array(columns[name], np.int64) for name in ("ix", "iy", "class_id"))
+    return MapCells(ix, iy, class_id, grid.classes, grid.cell_m)
+
+
+def _drawn(tracks: Sequence[Sequence[Pose]]) -> DrawnPath:
+    """The ways of all logs."""
+    rows = [row.pose for track in tracks for row in track]
+    starts = np.cumsum([len(track) for track in tracks[:-1]], dtype=np.int64).tolist()
+    return DrawnPath(np.array([row.x_m for row in rows]), np.array([row.y_m for row in rows]), tuple(starts))
+
+
+def _titles(site: Site, shown: MapCells, keyframes: int, style: SiteStyle) -> tuple[str, str]:
+    others = len(site.drives) - 1
+    title = site.drives[0].name + (f" and {others} more {'log' if others == 1 else 'logs'}" if others else "")
+    cell = f"cell {shown.cell_m:.2f} m"
+    parts = [f"estimator {style.estimator}", f"{keyframes:,} keyframes", cell, f"{len(shown.ix):,} cells"]
+    return title, "  ·  ".join(parts)
