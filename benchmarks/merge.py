@@ -13,6 +13,7 @@ poses drawn uniformly from the rectangle that the robots drove in.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import subprocess
 import sys
@@ -31,10 +32,11 @@ from semslam.pipeline.run_tables import run_tables
 from semslam.slam.surfel.prior import Grid, read_prior
 from semslam.slam.surfel.registration import place_in
 from semslam.tables.parquet import TableFiles
-from semslam.tables.spec import MOTION, PLACES, SITES, SPLITS, TRAJECTORY, TRUTH
+from semslam.tables.spec import MOTION, PLACES, SPLITS, TRAJECTORY, TRUTH
 
 OK_M, OK_DEG = 0.1, 2.0
 DRAWS = 200
+MERGE = "`merge`"
 Poses = dict[int, SE2]
 """By stamp."""
 
@@ -89,6 +91,8 @@ def main() -> None:
                 for name, errors in compared(args.run, site, log, known):
                     print(errors.line(log, name), flush=True)
                     rows.setdefault(name, []).append(errors)
+                    if log != site and name == MERGE:
+                        rows.setdefault(f"{MERGE}, without first logs", []).append(errors)
     if rows:
         print(f"\n### All\n\n{HEAD}")
         for name, parts in rows.items():
@@ -99,17 +103,16 @@ HEAD = """| log | | keyframes with a pose | mean error | | worst | called ok, wr
 |---|---|---|---|---|---|---|"""
 
 
-def merged(run: Path, names: Sequence[str]) -> tuple[dict[str, list[str]], float]:
-    """Logs by site, and how long it took."""
+def merged(run: Path, names: Sequence[str]) -> tuple[dict[str, list[str]], float | None]:
+    """Logs by site, and the seconds it took; None if it was done before."""
     start = time.monotonic()
     chosen = [word for name in names for word in ("--log", name)]
-    command = [sys.executable, "-m", "semslam.pipeline.cli", "merge", str(run), "--quiet", *chosen]
-    print(subprocess.run(command, check=True, text=True, stdout=subprocess.PIPE).stdout)
-    rows = TableFiles(SITES, [run / "sites" / "sites.parquet"]).read(["log", "site"])
-    sites: dict[str, list[str]] = {}
-    for log, site in zip(rows["log"], rows["site"], strict=True):
-        sites.setdefault(site, []).append(log)
-    return sites, time.monotonic() - start
+    command = [sys.executable, "-m", "semslam.pipeline.cli", "merge", str(run), "--json", *chosen]
+    told = json.loads(subprocess.run(command, check=True, text=True, stdout=subprocess.PIPE).stdout)
+    sites = {one["site"]: [row["log"] for row in one["logs"]] for one in told["sites"]}
+    for row in (row for one in told["sites"] for row in one["logs"]):
+        print(f"{row['log']}: {row['verdict']}, site {row['site']}")
+    return sites, None if told["cached"] else time.monotonic() - start
 
 
 def homes_of(folder: Path) -> dict[str, tuple[str, int]]:
@@ -118,7 +121,7 @@ def homes_of(folder: Path) -> dict[str, tuple[str, int]]:
     return dict(zip(rows["log"], zip(rows["variant"], rows["scene"], strict=True), strict=True))
 
 
-def tell_joins(sites: Mapping[str, Sequence[str]], homes: Mapping[str, tuple[str, int]], seconds: float) -> None:
+def tell_joins(sites: Mapping[str, Sequence[str]], homes: Mapping[str, tuple[str, int]], seconds: float | None) -> None:
     """Pairs of logs that are joined and should not be, and the other way round."""
     place = {log: site for site, logs in sites.items() for log in logs}
     pairs = list(combinations(place, 2))
@@ -126,8 +129,9 @@ def tell_joins(sites: Mapping[str, Sequence[str]], homes: Mapping[str, tuple[str
     joined = [place[one] == place[other] for one, other in pairs]
     wrong = sum(together and not alike for together, alike in zip(joined, same, strict=True))
     missed = sum(alike and not together for together, alike in zip(joined, same, strict=True))
+    took = "" if seconds is None else f" in {seconds:.0f} s"
     print(
-        f"{len(place)} logs of {len({homes[log] for log in place})} homes, {len(sites)} sites in {seconds:.0f} s: "
+        f"{len(place)} logs of {len({homes[log] for log in place})} homes, {len(sites)} sites{took}: "
         f"{wrong} of {len(pairs) - sum(same)} pairs joined wrongly, {missed} of {sum(same)} missed",
         flush=True,
     )
@@ -138,7 +142,7 @@ def compared(run: Path, site: str, log: str, known: Mapping[str, Poses]) -> Iter
     start = known[site][min(known[site])]
     true = {stamp: start.between(pose) for stamp, pose in known[log].items()}
     poses, called = track(run / "sites" / site / log)
-    yield "`merge`", judged(true, poses, called)
+    yield MERGE, judged(true, poses, called)
     if log != site:
         own, _ = track(run / "results" / log / "surfel")
         shift = laid(run, log, site)

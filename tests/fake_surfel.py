@@ -26,8 +26,8 @@ CONFIG = SurfelConfig(surfels=600)
 STARTS = {"here": SE2(0.0, 0.0, 0.0), "there": SE2(0.9, -0.6, 2.2), "back": SE2(-0.8, 0.7, -2.0)}
 """Where drives begin in the frame of their room."""
 LOGS = {
-    "monday": ("box5", "here", 7),
-    "tuesday": ("box5", "there", 6),
+    "monday": ("box5", "here", 9),
+    "tuesday": ("box5", "there", 8),
     "cellar": ("box11", "here", 3),
     "attic": ("box12", "here", 3),
     "dark": ("box5", "here", 3),

@@ -12,7 +12,7 @@ from semslam.stages.catalogue import STAGES
 from semslam.tables.spec import ALL_TABLES, Column, Table
 
 PAGE = Path(__file__).parent.parent / "data_spec.md"
-COMMANDS = {"evaluate", "simulate", "train"}
+COMMANDS = {"evaluate", "merge", "simulate", "train"}
 """They write tables, and are no stages."""
 
 

@@ -50,9 +50,9 @@ def away(one: SE2, other: SE2) -> float:
 def sites() -> list[Site]:
     """Two drives of one room and one of another."""
     drives = [
-        make_known("b", "box5", "there", 9),
-        make_known("c", "box11", "here", 9),
-        make_known("a", "box5", "here", 10),
+        make_known("b", "box5", "there", 7),
+        make_known("c", "box11", "here", 5),
+        make_known("a", "box5", "here", 8),
     ]
     return merge(drives, GRID, CONFIG, silent)
 
@@ -217,14 +217,14 @@ def test_a_site_is_a_folder_with_a_map_and_the_tracks(run: World, capsys: Captur
     assert {name.removeprefix("monday/") for name in first if name.startswith("monday/")} == files | tracks
     rows = TableFiles(SITES, [folder / "sites.parquet"]).read()
     assert (rows["log"], rows["site"]) == (["cellar", "monday", "tuesday"], ["cellar", "monday", "monday"])
-    assert (rows["verdict"], rows["keyframes"]) == (["lost", "first", "found"], [2, 6, 5])
+    assert (rows["verdict"], rows["keyframes"]) == (["lost", "first", "found"], [2, 8, 7])
     track = TableFiles(TRAJECTORY, [folder / "monday" / "tuesday" / "trajectory.parquet"]).read()
-    room, tuesday = true_drive("here", 1)[0], true_drive("there", 6)
+    room, tuesday = true_drive("here", 1)[0], true_drive("there", 8)
     for x, y, heading, true in zip(track["x_m"], track["y_m"], track["heading_rad"], tuesday, strict=True):
         assert away(room.between(true), SE2(x, y, heading)) < 0.03
     prior = read_prior(folder / "monday" / "places.parquet", GRID)
-    assert len(prior.places) == 11
-    assert TableFiles(PLACES, [folder / "monday" / "places.parquet"]).read(["frame"])["frame"] == list(range(11))
+    assert len(prior.places) == 15
+    assert TableFiles(PLACES, [folder / "monday" / "places.parquet"]).read(["frame"])["frame"] == list(range(15))
     assert TableFiles(CELLS, [folder / "monday" / "map.parquet"]).rows > 500
     wednesday = make_known("wednesday", "box5", "back", 5)
     own = submap_of([one.place for one in wednesday.known], [one.seen for one in wednesday.known], GRID)

@@ -12,6 +12,7 @@
       cache/results.json           which entry each folder of results was copied from, and the stamps of the copies
       results/<log>/<variant>/     the files of the last stage under stable names
       results/evaluation.parquet   what `semslam evaluate` wrote last
+      sites/                       what `semslam merge` wrote last
       .lock                        held by the run that works here, with its process id
 
 Everything under `cache` but its three `.json` files is published by renaming a finished folder and never changed

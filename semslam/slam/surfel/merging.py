@@ -317,6 +317,7 @@ def _aligned(
         heading_noise_rad=_MOTION_RAD,
         position_bias_m=_STEADY_M,
         heading_bias_rad=_STEADY_RAD,
+        rounds=config.rounds or SurfelConfig().rounds,  # 0 is for tracks; logs that nothing aligns are not merged
     )
     return smooth(places, np.zeros(3), trusted, watch)
 
