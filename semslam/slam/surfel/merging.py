@@ -178,18 +178,29 @@ class Grouping:
         groups.append({index: SE2(0.0, 0.0, 0.0)})
 
     def _meet(self, groups: list[_Group]) -> bool:
-        """Join two sites, of which a log of the smaller is found in the larger; False if there are none."""
+        """Join two sites, of which a log of one is found in the other; False if there are none."""
         groups.sort(key=lambda group: (-len(group), min(group)))
         for smaller in reversed(groups):
             for larger in groups[: groups.index(smaller)]:
-                for index in sorted(smaller):
-                    larger_from_own = self._found(index, larger)
-                    if larger_from_own is not None:
-                        larger_from_smaller = larger_from_own @ smaller[index].inverse()
-                        larger |= {one: larger_from_smaller @ pose for one, pose in smaller.items()}
-                        groups.remove(smaller)
-                        return True
+                larger_from_smaller = self._between(larger, smaller)
+                if larger_from_smaller is not None:
+                    larger |= {one: larger_from_smaller @ pose for one, pose in smaller.items()}
+                    groups.remove(smaller)
+                    return True
         return False
+
+    def _between(self, larger: _Group, smaller: _Group) -> SE2 | None:
+        """larger_from_smaller, by the first log of one that is found in the other: where little is shared, it may decide
+        which of two is asked."""
+        for index in sorted(smaller):
+            found = self._found(index, larger)
+            if found is not None:
+                return found @ smaller[index].inverse()
+        for index in sorted(larger):
+            found = self._found(index, smaller)
+            if found is not None:
+                return larger[index] @ found.inverse()
+        return None
 
     def _found(self, index: int, group: _Group) -> SE2 | None:
         """group_from_own, if that is sure and nothing speaks against it; asked once of each site as it is."""

@@ -45,6 +45,12 @@ _WORTH_A_LOOK = 0.4
 """Guesses with less than this share of the best one's score are not looked at."""
 _SEEN = 0.15
 """Share of samples that must be found again."""
+_SHARED = 0.15
+"""Share of the smaller one's voxels that two keyframes must have in common to be compared one by one."""
+_ALIKE = 0.3
+"""Share of those pairs whose pictures must surely show the same place: between logs of simulated homes it is 0.67 to 1
+at right poses, moved furniture included; it is 0 where a log was laid behind a wall, from where most is hidden and the
+rest agrees."""
 _WORTH = 60.0
 """Samples that a log gives independently. Few, because what differs between the right pose and one that looks alike
 are a few things in a room, not thousands of pixels of its walls."""
@@ -78,6 +84,8 @@ class Proposal:
     """Share of samples that are, and are not hidden. It is no evidence: a wrong pose may see more."""
     covariance: Floats
     """(3, 3) of its x, y and heading along the other map's axes, if it is the right way."""
+    alike: float = 1.0
+    """Share of the pairs of keyframes with much in common whose pictures surely show the same place; 0 without any."""
     probability: float = 0.0
     """Among all proposals."""
 
@@ -127,10 +135,10 @@ def _proposal(asked: Sequence[Place], known: Sequence[Place], target: Target, gu
         level, height = 1.0 / _TILT_RAD**2, 1.0 / _HEIGHT_M**2
         weight = np.diag([level, level, 1e-6, 1e-6, 1e-6, height])
         shift = nudged(shift, np.asarray(-np.linalg.solve(hessian + weight, gradient + weight @ unlevel(shift))))
-    seen, samples = _compared(asked, known, shift)
+    seen, samples, alike = _compared(asked, known, shift)
     keep = np.ix_([3, 4, 2], [3, 4, 2])
     covariance = np.asarray(DOUBT * np.linalg.inv(hessian + weight)[keep], np.float64)
-    return Proposal(planar(shift), guess.score, _likeness(seen), seen.told / max(1, samples), covariance)
+    return Proposal(planar(shift), guess.score, _likeness(seen), seen.told / max(1, samples), covariance, alike)
 
 
 def _likeness(seen: Agreement) -> float:
@@ -140,17 +148,23 @@ def _likeness(seen: Agreement) -> float:
     return (1.0 - strangers) * fits + strangers * math.log(_STRANGERS_RIGHT / _STRANGERS_WRONG)
 
 
-def _compared(asked: Sequence[Place], known: Sequence[Place], shift: Floats) -> tuple[Agreement, int]:
-    """Pictures of the log looked up in those of the map that see most of the same; and how many samples there were."""
+def _compared(asked: Sequence[Place], known: Sequence[Place], shift: Floats) -> tuple[Agreement, int, float]:
+    """Pictures of the log looked up in those of the map that see most of the same; how many samples there were; and
+    which share of pairs is alike."""
     whole, samples = Agreement(0.0, 0), 0
+    alike: list[bool] = []
     for place in asked:
         here = moved(place, shift @ place.pose)
         shared = shared_voxels(known, here)
         best = sorted(shared, key=lambda index: (-shared[index], index))[:_REFERENCES]
         samples += 2 * _REFERENCES * len(_of(here).sight.points)
         for index in best:
-            whole += agreement(_of(known[index]).sight, _of(here).sight, between(known[index].pose, here.pose))
-    return whole, samples
+            one, other = _of(known[index]).sight, _of(here).sight
+            seen = agreement(one, other, between(known[index].pose, here.pose))
+            whole += seen
+            if shared[index] >= _SHARED * min(len(known[index].voxels), len(here.voxels)):
+                alike.append(seen.same_place(len(one.points) + len(other.points), sure=True))
+    return whole, samples, sum(alike) / max(1, len(alike))
 
 
 def _of(place: Place) -> Keyframe:
@@ -169,7 +183,9 @@ def _judged(proposals: list[Proposal]) -> Placement:
     if not told[0].good:
         return Placement(LOST, told)
     rivals = [one for one in told[1:] if one.good and _WORTH * (told[0].likeness - one.likeness) < _MARGIN]
-    return Placement(AMBIGUOUS if rivals else FOUND, told)
+    if rivals:
+        return Placement(AMBIGUOUS, told)
+    return Placement(FOUND if told[0].alike >= _ALIKE else LOST, told)
 
 
 def _distinct(proposals: Sequence[Proposal]) -> list[Proposal]:
