@@ -190,8 +190,8 @@ class Grouping:
         return False
 
     def _between(self, larger: _Group, smaller: _Group) -> SE2 | None:
-        """larger_from_smaller, by the first log of one that is found in the other: where little is shared, it may decide
-        which of two is asked."""
+        """larger_from_smaller, by the first log of one that is found in the other: where little is shared, it may
+        decide which of two is asked."""
         for index in sorted(smaller):
             found = self._found(index, larger)
             if found is not None:
