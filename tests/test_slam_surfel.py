@@ -375,8 +375,9 @@ def test_doubt_grows_where_motion_alone_leads() -> None:
 
 RESTING = SE2(0.0, 0.0, 0.0)
 """What wheels tell of a robot that was carried."""
-BEFORE = AFTER = 8
-"""Keyframes before a robot was carried, and after."""
+BEFORE, AFTER = 12, 8
+"""Keyframes before a robot was carried, and after. After fewer before it, most of these robots are laid somewhere at
+once, and what one that is lost keeps in mind (where it may have been parked, its group) is not tried."""
 
 
 @lru_cache
@@ -423,7 +424,7 @@ def test_a_robot_that_was_carried_to_another_room_is_not_found_in_the_first(moti
 
 @pytest.mark.parametrize("kind", ["blind", "carried"])
 def test_parts_hold_everything(kind: str) -> None:
-    """A track put away and taken up twice ends with the very numbers of one that was not."""
+    """A track put away and taken up several times ends with the very numbers of one that was not."""
     if kind == "blind":
         steps, cuts = (
             observed(make_views(make_room(), make_drive(9), bias=BIAS, noise_m=0.02, noise_rad=0.02)),
@@ -433,7 +434,7 @@ def test_parts_hold_everything(kind: str) -> None:
         estimator = walked(steps)
         whole = estimator.finish()
     else:
-        steps, cuts = list(carried(5, RESTING)[0]), (0, BEFORE, BEFORE + 1, BEFORE + AFTER)
+        steps, cuts = list(carried(5, RESTING)[0]), (0, BEFORE, BEFORE + 1, BEFORE + 3, BEFORE + AFTER)
         whole, estimator = carried_track(5, RESTING)
     again, parts = SurfelEstimator(CONFIG, GRID), list[bytes]()
     for start, stop in pairwise(cuts):
