@@ -3,7 +3,9 @@
     SITE/                        named after the site's first log
       places.parquet             table 16: a map for `--prior`
       map.parquet                table 9
-      map.png, map.yaml, map.pgm
+      layers.parquet             table 18, from the thinned depth of places.parquet
+      map.png, layers.png
+      map.yaml, map.pgm          of the layers
       <log>/trajectory.parquet   table 10
       <log>/trajectory.tum
 
@@ -19,7 +21,11 @@ from typing import Any
 
 import numpy as np
 
+from semslam.geometry.frames import planar
+from semslam.slam.depth_sight import Columns, DepthImage
 from semslam.slam.exchange import map_yaml, occupancy_image, pgm, tum, unknown_grey
+from semslam.slam.layer_picture import layers_subtitle, render_layers
+from semslam.slam.layers import LayerCells, Layers
 from semslam.slam.picture import MapCells
 from semslam.slam.picture import Path as DrawnPath
 from semslam.slam.render import render_map
@@ -28,7 +34,7 @@ from semslam.slam.surfel.prior import Grid, Remembered, place_row
 from semslam.slam.surfel.site_map import Pose, cells, remembered, thinned
 from semslam.stages.settings import ExportConfig
 from semslam.tables.parquet import TableFileWriter, write_table
-from semslam.tables.spec import CELLS, PLACES, TRAJECTORY
+from semslam.tables.spec import CELLS, LAYERS, PLACES, TRAJECTORY
 
 
 @dataclass(frozen=True)
@@ -60,7 +66,27 @@ def write_site(folder: Path, site: Site, tracks: Sequence[Sequence[Pose]], style
     path = _drawn(tracks)
     title, subtitle = _titles(site, shown, len(path.x_m), style)
     (folder / "map.png").write_bytes(render_map(shown, path, title, subtitle, style.export.pixels_per_cell))
-    return _write_occupancy(folder, shown, style.export)
+    return _write_layers(folder, _layers(known, style.export), path, title, style)
+
+
+def _layers(known: Sequence[Remembered], config: ExportConfig) -> LayerCells:
+    """Occupancy and heights from the depth that the map remembers."""
+    low_m, high_m = config.min_obstacle_height_m, config.max_obstacle_height_m
+    layers = Layers(Columns(config.layer_cell_m, low_m, high_m, config.layer_depth_m))
+    for one in known:
+        if one.place.keyframe is not None:
+            sight = one.place.keyframe.sight
+            layers.add(DepthImage(sight.depth_m, *sight.intrinsics, sight.robot_from_camera), planar(one.place.pose))
+    return layers.cells()
+
+
+def _write_layers(folder: Path, layers: LayerCells, path: DrawnPath, title: str, style: SiteStyle) -> bool:
+    """As table, picture, and for map_server; False if the map is too large for that."""
+    write_table(folder / "layers.parquet", LAYERS, layers.rows(), layers.about(style.estimator))
+    thresholds = style.export.free_threshold, style.export.occupied_threshold
+    subtitle = layers_subtitle(layers, path, style.estimator)
+    (folder / "layers.png").write_bytes(render_layers(layers, path, title, subtitle, thresholds))
+    return _write_occupancy(folder, layers, style.export)
 
 
 def _write_places(path: Path, known: Sequence[Remembered], style: SiteStyle) -> None:
@@ -88,15 +114,15 @@ def _write_track(folder: Path, track: Sequence[Pose], style: SiteStyle) -> None:
     (folder / "trajectory.tum").write_text(lines, encoding="ascii", newline="\n")
 
 
-def _write_occupancy(folder: Path, shown: MapCells, config: ExportConfig) -> bool:
+def _write_occupancy(folder: Path, layers: LayerCells, config: ExportConfig) -> bool:
     """map.pgm and map.yaml; False if the map is too large for them."""
     occupied, free = config.occupied_threshold, config.free_threshold
-    found = occupancy_image(shown, unknown_grey(free, occupied))
+    found = occupancy_image(layers, free, occupied, unknown_grey(free, occupied))
     if found is None:
         return False
     image, corner = found
     (folder / "map.pgm").write_bytes(pgm(image))
-    text = map_yaml("map.pgm", shown.cell_m, corner, occupied, free)
+    text = map_yaml("map.pgm", config.layer_cell_m, corner, occupied, free)
     (folder / "map.yaml").write_text(text, encoding="ascii", newline="\n")
     return True
 

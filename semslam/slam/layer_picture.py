@@ -59,6 +59,18 @@ def render_layers(cells: LayerCells, path: Path, title: str, subtitle: str, thre
     return canvas.png()
 
 
+def layers_subtitle(cells: LayerCells, path: Path, estimator: str) -> str:
+    """What the layers were made of."""
+    columns = cells.columns
+    words = [
+        f"estimator {estimator}",
+        f"depth of {len(path.posed):,} keyframes",
+        f"cell {columns.cell_m:g} m",
+        f"obstacles from {columns.low_m:g} to {columns.high_m:g} m",
+    ]
+    return "  ·  ".join(words)
+
+
 def _fit(cells: LayerCells, path: Path) -> View:
     corners = np.stack([cells.ix, cells.iy], 1)
     return fit_cells(corners, cells.columns.cell_m, path, 0, _LARGEST, _LEAST)

@@ -53,6 +53,32 @@ class LayerCells:
     views: NDArray[np.uint32]
     columns: Columns
 
+    def rows(self) -> dict[str, list[Any]]:
+        """Of the layers table."""
+        return {
+            "ix": self.ix.tolist(),
+            "iy": self.iy.tolist(),
+            "x_m": ((self.ix + 0.5) * self.columns.cell_m).tolist(),
+            "y_m": ((self.iy + 0.5) * self.columns.cell_m).tolist(),
+            **{name: _nullable(getattr(self, name)) for name in ("occupancy", "floor_m", "top_m")},
+            "points": self.points.tolist(),
+            "views": self.views.tolist(),
+        }
+
+    def about(self, estimator: str) -> dict[str, Any]:
+        """The table's metadata."""
+        return {
+            "cell_m": self.columns.cell_m,
+            "min_obstacle_height_m": self.columns.low_m,
+            "max_obstacle_height_m": self.columns.high_m,
+            "estimator": estimator,
+        }
+
+
+def _nullable(values: _Floats) -> list[float | None]:
+    """Values with None for NaN."""
+    return [None if value != value else value for value in values.tolist()]
+
 
 class _Tile:
     """64 x 64 cells, [iy, ix]."""

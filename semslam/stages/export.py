@@ -24,7 +24,6 @@ from itertools import groupby
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semslam.geometry import rle
 from semslam.geometry.frames import SE2
@@ -32,7 +31,7 @@ from semslam.geometry.projection import flying, main_body, points_in_robot
 from semslam.slam.depth_sight import Columns, DepthImage
 from semslam.slam.evidence import LARGEST_M
 from semslam.slam.exchange import MAX_PIXELS, map_yaml, occupancy_image, pgm, tum, unknown_grey
-from semslam.slam.layer_picture import render_layers
+from semslam.slam.layer_picture import layers_subtitle, render_layers
 from semslam.slam.layers import LayerCells, Layers
 from semslam.slam.objects import Patch, things
 from semslam.slam.picture import MapCells, Path
@@ -63,15 +62,16 @@ def run(ctx: StageContext) -> None:
     with ctx.shard(0) as shard:
         _write_trajectory(shard, track, poses)
         write_table(shard.path("map.parquet"), CELLS, rows, dict(cells.meta))
-        subtitle = _subtitle(str(cells.meta["estimator"]), path, shown)
+        estimator = str(cells.meta["estimator"])
+        subtitle = _subtitle(estimator, path, shown)
         shard.path("map.png").write_bytes(render_map(shown, path, ctx.log, subtitle, config.pixels_per_cell))
         ctx.progress(3, _FILES)
         layers = _layers(ctx, placed, config)
-        _write_layers(shard, layers, cells.meta)
+        shard.table(LAYERS, layers.about(estimator)).append(layers.rows())
         ctx.progress(4, _FILES)
         _write_occupancy(shard, layers, config)
         ctx.progress(6, _FILES)
-        subtitle = _layers_subtitle(str(cells.meta["estimator"]), path, layers)
+        subtitle = layers_subtitle(layers, path, estimator)
         thresholds = config.free_threshold, config.occupied_threshold
         shard.path("layers.png").write_bytes(render_layers(layers, path, ctx.log, subtitle, thresholds))
         _write_places(ctx, shard)
@@ -189,31 +189,6 @@ def _layers(ctx: StageContext, poses: Mapping[int, SE2], config: ExportConfig) -
     return layers.cells()
 
 
-def _write_layers(shard: ShardWriter, cells: LayerCells, meta: Mapping[str, Any]) -> None:
-    columns = cells.columns
-    rows = {
-        "ix": cells.ix.tolist(),
-        "iy": cells.iy.tolist(),
-        "x_m": ((cells.ix + 0.5) * columns.cell_m).tolist(),
-        "y_m": ((cells.iy + 0.5) * columns.cell_m).tolist(),
-        **{name: _nullable(getattr(cells, name)) for name in ("occupancy", "floor_m", "top_m")},
-        "points": cells.points.tolist(),
-        "views": cells.views.tolist(),
-    }
-    about = {
-        "cell_m": columns.cell_m,
-        "min_obstacle_height_m": columns.low_m,
-        "max_obstacle_height_m": columns.high_m,
-        "estimator": meta["estimator"],
-    }
-    shard.table(LAYERS, about).append(rows)
-
-
-def _nullable(values: NDArray[np.float64]) -> list[float | None]:
-    """Values with None for NaN."""
-    return [None if value != value else value for value in values.tolist()]
-
-
 def _write_occupancy(shard: ShardWriter, cells: LayerCells, config: ExportConfig) -> None:
     """map.pgm and map.yaml."""
     occupied, free = config.occupied_threshold, config.free_threshold
@@ -228,17 +203,6 @@ def _write_occupancy(shard: ShardWriter, cells: LayerCells, config: ExportConfig
     shard.path("map.pgm").write_bytes(pgm(image))
     text = map_yaml("map.pgm", config.layer_cell_m, corner, occupied, free)
     shard.path("map.yaml").write_text(text, encoding="ascii", newline="\n")
-
-
-def _layers_subtitle(estimator: str, path: Path, cells: LayerCells) -> str:
-    columns = cells.columns
-    words = [
-        f"estimator {estimator}",
-        f"depth of {len(path.posed):,} keyframes",
-        f"cell {columns.cell_m:g} m",
-        f"obstacles from {columns.low_m:g} to {columns.high_m:g} m",
-    ]
-    return "  ·  ".join(words)
 
 
 def _subtitle(estimator: str, path: Path, cells: MapCells) -> str:
