@@ -212,7 +212,7 @@ def test_a_site_is_a_folder_with_a_map_and_the_tracks(run: World, capsys: Captur
     ]
     folder = run.out / "sites"
     first = contents(folder)
-    files = {"map.parquet", "map.pgm", "map.png", "map.yaml", "places.parquet"}
+    files = {"layers.parquet", "layers.png", "map.parquet", "map.pgm", "map.png", "map.yaml", "places.parquet"}
     tracks = {f"{log}/trajectory.{end}" for log in ("monday", "tuesday") for end in ("parquet", "tum")}
     assert {name.removeprefix("monday/") for name in first if name.startswith("monday/")} == files | tracks
     rows = TableFiles(SITES, [folder / "sites.parquet"]).read()
