@@ -13,8 +13,8 @@ import numpy as np
 from semslam.geometry.frames import SE2
 from semslam.slam.estimator import Step
 from semslam.slam.surfel.merging import Drive
+from semslam.slam.surfel.places import Keyframe, placed
 from semslam.slam.surfel.prior import Remembered, Seen, place_row
-from semslam.slam.surfel.tracking import Keyframe, placed
 from semslam.stages.catalogue import STAGES
 from semslam.stages.contract import StageContext
 from semslam.stages.settings import SurfelConfig

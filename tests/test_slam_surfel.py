@@ -20,12 +20,12 @@ from semslam.slam.estimator import PoseEstimate, Step, View
 from semslam.slam.surfel.alignment import Target, change_between, nudged
 from semslam.slam.surfel.estimator import SurfelEstimator
 from semslam.slam.surfel.motion_prior import MotionPrior
+from semslam.slam.surfel.places import Keyframe
 from semslam.slam.surfel.prior import Grid, read_prior
 from semslam.slam.surfel.registration import FOUND, LOST, place_in
 from semslam.slam.surfel.semantic_field import ClassMap, candidates
 from semslam.slam.surfel.sight import Sight, agreement
 from semslam.slam.surfel.surfels import surfels_of
-from semslam.slam.surfel.tracking import Keyframe
 from semslam.slam.verdict import OK, UNCERTAIN, verdict_of
 from semslam.stages import localize
 from semslam.stages.contract import FinishedShard

@@ -15,10 +15,11 @@ from semslam.slam.surfel.alignment import nudged
 from semslam.slam.surfel.comparisons import Comparisons
 from semslam.slam.surfel.coverage import Coverage
 from semslam.slam.surfel.estimator import SurfelEstimator
+from semslam.slam.surfel.places import Keyframe, placed
 from semslam.slam.surfel.prior import Grid
+from semslam.slam.surfel.search import Found
 from semslam.slam.surfel.sight import Agreement
 from semslam.slam.surfel.surfels import Surfels, surfels_of
-from semslam.slam.surfel.tracking import Found, Keyframe, placed
 from semslam.slam.surfel.uncertainty import along, grown
 from semslam.stages.settings import SurfelConfig
 from tests.depth_world import make_drive, make_room, make_views, matrix, observed

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from semslam.geometry.frames import Matrix, invert
 from semslam.slam.surfel.alignment import between, change_between
+from semslam.slam.surfel.places import Keyframe, Place
+from semslam.slam.surfel.search import HELD_M, held
 from semslam.slam.surfel.sight import agreement
-from semslam.slam.surfel.tracking import HELD_M, Keyframe, Place, held
 
 Floats = NDArray[np.float64]
 

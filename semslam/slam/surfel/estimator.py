@@ -19,13 +19,14 @@ from semslam.geometry.frames import SE2, planar
 from semslam.slam.checkpoint import as_array, pack, unpack
 from semslam.slam.estimator import INERTIAL, NONE, START, VISUAL, Mode, PoseEstimate, Step
 from semslam.slam.surfel.motion_prior import MotionPrior, noise_sigmas
+from semslam.slam.surfel.places import Anchor, Keyframe, Place, moved, placed
 from semslam.slam.surfel.prior import Grid, Seen, place_row, read_prior, submap_of
 from semslam.slam.surfel.registration import AMBIGUOUS, Placement, place_in
 from semslam.slam.surfel.rejoining import rejoined, without_specks
 from semslam.slam.surfel.sight import Sight
 from semslam.slam.surfel.smoothing import Smoothed, smooth
 from semslam.slam.surfel.surfels import Surfels
-from semslam.slam.surfel.tracking import SHORTEST_S, Anchor, Keyframe, Place, Track, moved, placed
+from semslam.slam.surfel.tracking import SHORTEST_S, Track
 from semslam.slam.surfel.uncertainty import along, lever, turn_of
 from semslam.stages.settings import SurfelConfig
 

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from semslam.geometry.frames import SE2, Matrix, planar
 from semslam.slam.surfel.alignment import between
+from semslam.slam.surfel.places import Place, moved, placed
 from semslam.slam.surfel.prior import Grid, Remembered, submap_of
 from semslam.slam.surfel.registration import AMBIGUOUS, FOUND, LOST, Placement, Submap, place_in
 from semslam.slam.surfel.semantic_field import candidates
 from semslam.slam.surfel.smoothing import Smoothed, smooth
-from semslam.slam.surfel.tracking import Place, moved, placed
 from semslam.stages.settings import SurfelConfig
 
 Floats = NDArray[np.float64]

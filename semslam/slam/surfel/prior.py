@@ -18,11 +18,11 @@ from semslam.geometry.frames import planar
 from semslam.geometry.grid import Planes, to_dense, to_sparse
 from semslam.labels import UNOBSERVED
 from semslam.slam.evidence import Evidence
+from semslam.slam.surfel.places import Keyframe, Place, placed
 from semslam.slam.surfel.registration import Submap
 from semslam.slam.surfel.semantic_field import ClassMap
 from semslam.slam.surfel.sight import Sight
 from semslam.slam.surfel.surfels import Surfels
-from semslam.slam.surfel.tracking import Keyframe, Place, placed
 from semslam.tables.parquet import TableFiles, made_by, rows_of
 from semslam.tables.pictures import decode_depth, encode_depth
 from semslam.tables.spec import PLACES

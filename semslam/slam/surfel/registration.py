@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from semslam.geometry.frames import SE2, planar
 from semslam.slam.surfel.alignment import Target, between, nudged
+from semslam.slam.surfel.places import Keyframe, Place, moved, shared_voxels
+from semslam.slam.surfel.search import unlevel
 from semslam.slam.surfel.semantic_field import Candidate, ClassMap, candidates
 from semslam.slam.surfel.sight import Agreement, agreement
 from semslam.slam.surfel.smoothing import DOUBT
 from semslam.slam.surfel.surfels import Surfels
-from semslam.slam.surfel.tracking import Keyframe, Place, moved, shared_voxels, unlevel
 
 Floats = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
+from semslam.slam.surfel.places import Place, moved
 from semslam.slam.surfel.prior import Grid, Seen, submap_of
 from semslam.slam.surfel.registration import Submap, place_in
 from semslam.slam.surfel.smoothing import Smoothed
-from semslam.slam.surfel.tracking import Place, moved
 
 _LEAST = 5
 """Keyframes of a part that is looked for: fewer show too little to be sure."""

@@ -16,8 +16,8 @@ from semslam.geometry.frames import SE2, planar
 from semslam.slam.estimator import VISUAL, PoseEstimate
 from semslam.slam.evidence import Evidence
 from semslam.slam.surfel.merging import Site
+from semslam.slam.surfel.places import moved
 from semslam.slam.surfel.prior import Grid, Remembered
-from semslam.slam.surfel.tracking import moved
 from semslam.slam.verdict import verdict_of
 
 MOST_KEYFRAMES = 400

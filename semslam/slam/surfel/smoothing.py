@@ -22,7 +22,9 @@ from semslam.geometry.frames import SE2, Matrix
 from semslam.slam.surfel.alignment import change_between, nudged, pair_equations
 from semslam.slam.surfel.comparisons import Comparison, Comparisons
 from semslam.slam.surfel.motion_prior import PAUSE_S, UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S, bias_sigmas, noise_sigmas
-from semslam.slam.surfel.tracking import SHORTEST_S, Place, moved, shared_voxels, unlevel
+from semslam.slam.surfel.places import Place, moved, shared_voxels
+from semslam.slam.surfel.search import unlevel
+from semslam.slam.surfel.tracking import SHORTEST_S
 from semslam.stages.settings import SurfelConfig
 
 Floats = NDArray[np.float64]
