@@ -58,7 +58,7 @@ _TINY = 1e-12
 _CLEARLY = 0.3
 """Standard deviations by which the mean difference of one pose is smaller than that of another that is worse."""
 _WIDE_M, _WIDE_RAD = 0.2, 0.35
-"""Standard deviations of motion above which pictures alone must tell where a robot is ..."""
+"""Standard deviations of motion above which pictures alone must tell where a robot is."""
 
 
 @dataclass(frozen=True, eq=False)

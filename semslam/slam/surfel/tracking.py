@@ -31,7 +31,7 @@ _TOGETHER = 0.3
 _WIDER = 9.0
 """Variances are so many times larger in a second search."""
 _LOST_M, _LOST_RAD = 0.5, 0.6
-"""... and above which one of them may err."""
+"""Standard deviations of motion above which a single keyframe may be found in the wrong place."""
 
 
 class Track:
