@@ -35,6 +35,8 @@ FIRST, CONTRADICTED = "first", "contradicted"
 """Verdicts beside found, ambiguous and lost: the log whose frame is that of its site; a join that was undone."""
 _WITNESSES = 2
 """Logs of a site, those that share most with one that joins, on which it is laid by itself."""
+_LEAST = 5
+"""Keyframes of a site in which logs of a larger one are looked for: fewer show too little to be sure."""
 _APART_M, _APART_RAD = 0.25, 0.07
 """Two ways to the same pose contradict each other from here on: maps are good to centimetres, and 4 degrees are 0.3 m
 at the end of a room."""
@@ -196,7 +198,8 @@ class Grouping:
             found = self._found(index, larger)
             if found is not None:
                 return found @ smaller[index].inverse()
-        for index in sorted(larger):
+        enough = sum(len(self.drives[one].known) for one in smaller) >= _LEAST
+        for index in sorted(larger) if enough else ():
             found = self._found(index, smaller)
             if found is not None:
                 return larger[index] @ found.inverse()
