@@ -70,7 +70,7 @@ def _run_stepwise(ctx: StageContext) -> None:
             continue
         with ctx.shard(index) as shard:
             tables = {table.name: shard.table(table, track.meta) for table in (POSES, SNAPSHOTS, CELLS)}
-            steps = _steps(motion, observations, frames, track.shape, start, stop)
+            steps = read_steps(motion, observations, frames, track.shape, start, stop)
             for done, step in enumerate(steps, start + 1):
                 track.add(step, track.estimate(step), shard, tables, last=done == rows)
                 ctx.progress(done, rows)
@@ -95,14 +95,14 @@ def _run_whole(ctx: StageContext) -> None:
         with ctx.shard(index) as shard:
             tables = {table.name: shard.table(table, track.meta) for table in (POSES, SNAPSHOTS, CELLS)}
             places = shard.table(PLACES, {**track.meta, "side": track.grid[2]})
-            for done, step in enumerate(_steps(motion, observations, frames, track.shape, start, stop), start + 1):
+            for done, step in enumerate(read_steps(motion, observations, frames, track.shape, start, stop), start + 1):
                 estimator.step(step)
                 ctx.progress(done, total)
             shard.path(_STATE).write_bytes(estimator.part())
             if stop < rows:
                 continue
             poses = estimator.finish(lambda rounds: ctx.progress(rows + rounds, total))
-            steps = _steps(motion, observations, None, track.shape, 0, rows)
+            steps = read_steps(motion, observations, None, track.shape, 0, rows)
             for done, (step, pose) in enumerate(zip(steps, poses, strict=True), 1):
                 track.add(step, pose, shard, tables, last=done == rows)
             track.close(shard, tables)
@@ -232,7 +232,7 @@ class _SteppedTrack(_Track):
         self._outside, self._unmapped, self._steps = arrays["counts"].tolist()
 
 
-def _steps(
+def read_steps(
     motion: TableSource,
     observations: TableSource,
     frames: TableSource | None,
