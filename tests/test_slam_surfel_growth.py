@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 
@@ -22,7 +23,7 @@ from semslam.slam.surfel.sight import Agreement
 from semslam.slam.surfel.surfels import Surfels, surfels_of
 from semslam.slam.surfel.uncertainty import along, grown
 from semslam.stages.settings import SurfelConfig
-from tests.depth_world import make_drive, make_room, make_views, matrix, observed
+from tests.depth_world import SECOND, make_drive, make_room, make_views, matrix, observed
 from tests.slam_world import CELL_M, CLASSES, SIDE
 
 CONFIG = SurfelConfig(surfels=500, neighbours=4, rounds=3)
@@ -74,6 +75,35 @@ def test_a_log_that_was_cut_keeps_the_same_pictures() -> None:
         again.restore(parts)
     assert again.finish() == estimator.finish()
     assert [row["frame"] for row in again.rows()] == [row["frame"] for row in estimator.rows()]
+
+
+def test_what_is_left_out_is_tied_to_one_that_shows_the_same() -> None:
+    """Not to whatever was kept last: that may be in another room by now."""
+    places = long_track()._track.places
+    steps = laps()[0]
+    left_out = [(number, place) for number, place in enumerate(places) if place.anchor]
+    assert left_out
+    for number, place in left_out:
+        assert place.anchor is not None
+        known = places[place.anchor.index]
+        assert known.group == place.group
+        view = steps[number].view
+        assert view is not None
+        there = placed(Keyframe.of(view, CONFIG), place.pose, 1.0, None, linked=True)
+        assert len(np.intersect1d(there.voxels, known.voxels)) > len(there.voxels) / 3
+
+
+def test_a_robot_that_is_parked_where_all_is_known_was_not_carried() -> None:
+    """It sees what it saw before, if not from the very keyframe before."""
+    steps = list(laps()[0][: 5 * LAP])
+    last = steps[-1]
+    still = SE2(0.0, 0.0, 0.0)
+    parked = replace(last, frame=last.frame + 1, stamp_nanos=last.stamp_nanos + 600 * SECOND, motion=still)
+    estimator = SurfelEstimator(CONFIG, GRID)
+    for step in (*steps, parked):
+        estimator.step(step)
+    assert estimator._track.places[-2].anchor is not None
+    assert estimator._track.places[-1].group == estimator._track.places[0].group
 
 
 def test_settled_pairs_are_not_compared_again(monkeypatch: pytest.MonkeyPatch) -> None:

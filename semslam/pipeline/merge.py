@@ -1,7 +1,7 @@
 """Merge: the logs of a finished run sorted into the places they were recorded in, each with one map and one frame.
 
 Reads   places, poses      data_spec.md, tables 16 and 7, of estimator surfel
-Writes  sites              data_spec.md, table 18, and a folder for each site (site_files.py), as OUT/sites/
+Writes  sites              data_spec.md, table 19, and a folder for each site (site_files.py), as OUT/sites/
 
 The folder is made beside its name and renamed when it is whole. `merge.json` in it says what it was made of; if that is
 the same and nothing in the folder was changed, nothing is done again.
@@ -34,13 +34,13 @@ from semslam.slam.surfel.site_map import Pose, track_in
 from semslam.stages.contract import Stage
 from semslam.stages.settings import ExportConfig, LocalizeConfig
 from semslam.tables.parquet import TableFiles, write_table
-from semslam.tables.spec import CELLS, PLACES, POSES, SITES, TRAJECTORY, Table
+from semslam.tables.spec import CELLS, LAYERS, PLACES, POSES, SITES, TRAJECTORY, Table
 
 ESTIMATOR = "surfel"
 """Whose maps can be merged."""
 MARK = "merge.json"
 MERGE_FORMAT = "semslam-sites"
-MERGE_VERSION = 1
+MERGE_VERSION = 2
 """Rises whenever the same logs give other files."""
 _LIBRARIES = ("numpy", "opencv-contrib-python-headless", "gtsam", "small_gicp", "pyarrow")
 _POSE = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad", "verdict")
@@ -93,6 +93,7 @@ def merge_run(request: MergeRequest, stages: Sequence[Stage], watch: Watch) -> M
     target = request.target
     _refuse_foreign(target)
     with request.out.locked():
+        _recover(target)
         sources, notes = _sources(request)
         configs = {name: load_config(stages, stored=source.record.config) for name, source in sources.items()}
         key = _key(sources, configs, stages)
@@ -228,7 +229,7 @@ def _key(sources: Mapping[str, Source], configs: Mapping[str, Config], stages: S
     return key_of(
         {
             "version": MERGE_VERSION,
-            "spec": {table.name: table.version for table in (PLACES, CELLS, TRAJECTORY, SITES)},
+            "spec": {table.name: table.version for table in (PLACES, POSES, CELLS, TRAJECTORY, LAYERS, SITES)},
             "logs": digests,
             "localize": plain(localize),
             "export": plain(settings.export),
@@ -324,7 +325,18 @@ def _put(temporary: Path, target: Path) -> None:
     """Rename the folder into place; the one before goes away once the new one is there."""
     old = target.with_name(f"{TEMPORARY}{target.name}-{os.getpid()}-old")
     remove(old)
-    if target.exists():
-        target.rename(old)
-    temporary.rename(target)
+    try:
+        if target.exists():
+            target.rename(old)
+        temporary.rename(target)
+    except BaseException:
+        _recover(target)
+        raise
     remove(old)
+
+
+def _recover(target: Path) -> None:
+    """Put the folder back that was about to be replaced when that was cut short."""
+    for old in sorted(target.parent.glob(f"{TEMPORARY}{target.name}-*-old")):
+        if not target.exists():
+            old.rename(target)

@@ -93,7 +93,8 @@ def say_merged(console: Console, report: MergeReport) -> None:
         if row.verdict == "ambiguous":
             console.warn(f"`{row.log}` fits the map of `{row.other}` in several ways alike and was not joined to it")
         elif row.verdict == "contradicted":
-            console.warn(f"`{row.log}` was found in the map of `{row.other}`, but other logs contradict: not joined")
+            why = "other logs, or what both saw, contradict"
+            console.warn(f"`{row.log}` was found in the map of `{row.other}`, but {why}: not joined")
     sites = "1 site" if len(report.sites) == 1 else f"{len(report.sites)} sites"
     again = ", made before and unchanged" if report.cached else ""
     console.say(f"{len(report.rows)} logs, {sites}{again}: {report.folder}")

@@ -53,7 +53,8 @@ def render_layers(cells: LayerCells, path: Path, title: str, subtitle: str, thre
     canvas.text(LEFT, 44, canvas.shortened(title, 27, BOLD, room), 27, weight=BOLD)
     canvas.text(LEFT, 71, canvas.shortened(subtitle, 15, REGULAR, room), 15, colour=SOFT_INK)
     _draw_panel(canvas, left, cells, _kinds(cells, thresholds), "Occupancy")
-    draw_path(canvas, path, left)
+    for part in path.parts:
+        draw_path(canvas, part, left)
     _draw_panel(canvas, right, cells, _heights(cells), "Height of the top above the floor")
     _draw_legend(canvas, end + 32, cells, path, thresholds)
     return canvas.png()

@@ -95,7 +95,9 @@ class _Tile:
         rows, columns = part
         change = np.int8(HIT) * sight.hit[:, rows, columns] + np.int8(PASS) * sight.passed[:, rows, columns]
         odds = self.odds[:, window[0], window[1]]
-        odds[...] = np.clip(odds.astype(np.int16) + change, LEAST, MOST)
+        summed = np.clip(odds.astype(np.int16) + change, LEAST, MOST)
+        even = (summed == 0) & ((change != 0) | (odds != 0))  # zero is what nothing is known of
+        odds[...] = np.where(even, np.where(change < 0, -1, 1), summed)
         self.views[window] += sight.seen[part]
         level, row, column = sight.marks
         inside = (row >= rows.start) & (row < rows.stop) & (column >= columns.start) & (column < columns.stop)

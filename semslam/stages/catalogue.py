@@ -45,7 +45,7 @@ EXTRACT = Stage(
 )
 LOCALIZE = Stage(
     "localize",
-    version=4,
+    version=5,
     config=LocalizeConfig,
     reads=(FRAMES, MOTION, OBSERVATIONS),
     writes=(POSES, SNAPSHOTS, CELLS, PLACES),

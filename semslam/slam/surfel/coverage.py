@@ -49,6 +49,6 @@ def _surfaces(surfels: Surfels, map_from_robot: Matrix) -> NDArray[np.int64]:
 
 
 def voxel_numbers(points: NDArray[np.float64], side_m: float) -> NDArray[np.int64]:
-    """(N,) numbers of the voxels in which points (N, 3) lie, up to a million voxels from the origin."""
+    """(N,) numbers of the voxels in which points (N, 3) lie, up to half a million voxels from the origin."""
     cells = np.floor(points / side_m).astype(np.int64) + (1 << 19)
     return np.asarray((cells[:, 0] << 40) | (cells[:, 1] << 20) | cells[:, 2])

@@ -62,7 +62,8 @@ class Anchor:
     anchor_from_robot: Matrix
     """As it was found."""
     hessian: Floats
-    """(6, 6) of surfaces, for a turn and a shift along the axes of the anchor."""
+    """(6, 6) of the surfaces that tell the pose, the anchor's and those of others beside it, for a turn and a shift
+    along the axes of the anchor."""
 
 
 @dataclass(eq=False)
@@ -110,13 +111,30 @@ def moved(place: Place, pose: Matrix) -> Place:
     return replace(there, anchor=place.anchor)
 
 
-def shared_voxels(places: Sequence[Place], place: Place) -> dict[int, int]:
-    """How many voxels a place shares with others, by their number; only with those whose middles are nearest."""
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """Where the places are that have pictures."""
+
+    numbers: NDArray[np.int64]
+    middles: Floats
+    """(N, 3)"""
+
+    @staticmethod
+    def of(places: Sequence[Place]) -> Kept:
+        """Among all."""
+        numbers = [number for number, place in enumerate(places) if len(place.voxels)]
+        return Kept(np.array(numbers, np.int64), np.array([places[number].middle for number in numbers]).reshape(-1, 3))
+
+
+def shared_voxels(places: Sequence[Place], place: Place, kept: Kept | None = None) -> dict[int, int]:
+    """How many voxels a place shares with others, by their number; only with those whose middles are nearest. `kept`
+    of these places, for who asks more than once."""
     if not len(place.voxels):
         return {}
-    away = np.linalg.norm(np.array([one.middle for one in places]) - place.middle, axis=1)
-    near = np.argsort(away, kind="stable")[:_COMPARED]  # NaN comes last
-    counts = {int(i): len(np.intersect1d(place.voxels, places[i].voxels, assume_unique=True)) for i in near}
+    kept = kept or Kept.of(places)
+    away = np.linalg.norm(kept.middles - place.middle, axis=1)
+    near = kept.numbers[np.argsort(away, kind="stable")[:_COMPARED]].tolist()
+    counts = {i: len(np.intersect1d(place.voxels, places[i].voxels, assume_unique=True)) for i in near}
     return {index: count for index, count in counts.items() if count}
 
 

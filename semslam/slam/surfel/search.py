@@ -72,8 +72,6 @@ class Found:
     """Whether pictures alone would do to tell."""
     seen: Agreement
     """With the pictures around it."""
-    nearest: int = 0
-    """The place that shows most of the same."""
 
     def better_than(self, other: Found) -> bool:
         """Whether what pictures tell, not how much, speaks for this pose: a wall that slides agrees with more of

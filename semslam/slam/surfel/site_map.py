@@ -5,7 +5,6 @@ tracks of its logs.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -86,14 +85,15 @@ def _distinct(poses: Sequence[SE2], alike_m: float) -> list[int]:
 def track_in(site: Site, number: int, own: Sequence[Pose], ok_m: float, ok_rad: float) -> Iterator[Pose]:
     """A log's track, told in its own map's frame, in that of the site.
 
-    Keyframes that pictures do not place go with the nearest in time that they do, and keep their verdict.
+    Keyframes that are not in the map, since pictures do not place them or show nothing new, go with the one there whose
+    pose is nearest, and keep their verdict.
     """
     known, poses, errors = site.drives[number].known, site.poses[number], site.covariances[number]
-    stamps = [one.stamp_nanos for one in known]
+    places = [planar(one.place.pose) for one in known]
     numbers = {one.frame: index for index, one in enumerate(known)}
     for row in own:
         index = numbers.get(row.frame)
-        nearest = _nearest(stamps, row.stamp_nanos) if index is None else index
+        nearest = _nearest(places, row.pose) if index is None else index
         shift = planar(poses[nearest]) @ planar(known[nearest].place.pose).inverse()
         verdict = row.verdict
         if index is not None and errors:
@@ -102,8 +102,7 @@ def track_in(site: Site, number: int, own: Sequence[Pose], ok_m: float, ok_rad: 
         yield replace(row, pose=shift @ row.pose, verdict=verdict)
 
 
-def _nearest(stamps: Sequence[int], stamp: int) -> int:
-    """Number of the nearest of rising stamps; the earlier one of two."""
-    after = bisect_left(stamps, stamp)
-    around = [index for index in (after - 1, after) if 0 <= index < len(stamps)]
-    return min(around, key=lambda index: abs(stamps[index] - stamp))
+def _nearest(places: Sequence[SE2], pose: SE2) -> int:
+    """Number of the pose that is nearest, a radian counting as a metre; the first of several."""
+    away = [pose.between(place) for place in places]
+    return min(range(len(away)), key=lambda i: math.hypot(away[i].x_m, away[i].y_m) + abs(away[i].heading_rad))

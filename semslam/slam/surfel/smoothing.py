@@ -22,7 +22,7 @@ from semslam.geometry.frames import SE2, Matrix
 from semslam.slam.surfel.alignment import change_between, nudged, pair_equations
 from semslam.slam.surfel.comparisons import Comparison, Comparisons
 from semslam.slam.surfel.motion_prior import PAUSE_S, UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S, bias_sigmas, noise_sigmas
-from semslam.slam.surfel.places import Place, moved, shared_voxels
+from semslam.slam.surfel.places import Kept, Place, moved, shared_voxels
 from semslam.slam.surfel.search import unlevel
 from semslam.slam.surfel.tracking import SHORTEST_S
 from semslam.stages.settings import SurfelConfig
@@ -179,10 +179,11 @@ def _hold(equations: _Equations, index: int) -> None:
 def pairs_of(places: Sequence[Place], most: int) -> list[tuple[int, int]]:
     """Keyframes that see the same: of each those, at most so many, with which it shares most voxels; and neighbours."""
     found = {(index, index + 1) for index in range(len(places) - 1)}
+    kept = Kept.of(places)
     for index, place in enumerate(places):
         sizes = {
             other: count
-            for other, count in shared_voxels(places, place).items()
+            for other, count in shared_voxels(places, place, kept).items()
             if other != index and count >= _LEAST_SHARED * min(len(place.voxels), len(places[other].voxels))
         }
         for other in sorted(sizes, key=lambda one: (-sizes[one], one))[:most]:

@@ -56,7 +56,7 @@ class Track:
     def recall(self, place: Place) -> None:
         """Take a place as it was taken before."""
         self.places.append(place)
-        if place.keyframe is not None:
+        if place.keyframe is not None and place.linked:
             self._coverage.setdefault(place.group, Coverage()).add(place.keyframe.surfels, place.pose)
 
     def step(self, keyframe: Keyframe | None, motion: SE2 | None, seconds: float) -> Place:
@@ -91,23 +91,29 @@ class Track:
             self.prior.see(seen, seconds)
             if motion is not None and seconds <= PAUSE_S:
                 self.prior.learn(motion, seconds, seen, _covariance_in_robot(hessian, before.pose))
+        place = placed(keyframe, pose, seconds, motion, linked=True, group=self.group)
         if keyframe and found.sure and self._shown(keyframe, pose):
-            anchor = Anchor(found.nearest, between(self.places[found.nearest].pose, pose), hessian)
-            return self._leave_out(pose, seconds, motion, anchor)
-        return self._remember(keyframe, pose, seconds, motion, linked=True)
+            place = self._left_out(place, hessian)
+        self.recall(place)
+        return place
 
     def _shown(self, keyframe: Keyframe, pose: Matrix) -> bool:
         """Whether keyframes of this group show all that this one does."""
         coverage = self._coverage.get(self.group)
         return coverage is not None and coverage.holds(keyframe.surfels, pose)
 
-    def _leave_out(self, pose: Matrix, seconds: float, motion: SE2 | None, anchor: Anchor) -> Place:
-        """Keep the pose alone."""
-        turn = np.kron(np.eye(2), self.places[anchor.index].pose[:3, :3])
-        tied = replace(anchor, hessian=turn.T @ anchor.hessian @ turn)
-        place = replace(placed(None, pose, seconds, motion, linked=True, group=self.group), anchor=tied)
-        self.recall(place)
-        return place
+    def _left_out(self, place: Place, hessian: Floats) -> Place:
+        """The same without its pictures, tied to the one of its group that shows most of the same."""
+        shared = shared_voxels(self.places, place)
+        tied = [index for index in shared if self.places[index].linked and self.places[index].group == place.group]
+        if not tied:
+            return place
+        nearest = max(tied, key=lambda index: (shared[index], -index))
+        known = self.places[nearest].pose
+        turn = np.kron(np.eye(2), known[:3, :3])
+        anchor = Anchor(nearest, between(known, place.pose), turn.T @ hessian @ turn)
+        alone = placed(None, place.pose, place.seconds, place.motion, linked=True, group=place.group)
+        return replace(alone, anchor=anchor)
 
     def _go_on(
         self,
@@ -149,19 +155,18 @@ class Track:
         if keyframe is None:
             return None
         near = self._near(placed(keyframe, starts[0], 0.0, None, linked=False), linked=linked)
-        known = {index: (place.keyframe, place.pose) for index, place in near.items() if place.keyframe}
+        known = [(place.keyframe, place.pose) for place in near if place.keyframe]
         if not known:
             return None
-        found = Search(keyframe, list(known.values()), starts, covariance, self._config).result()
-        return replace(found, nearest=next(iter(known))) if found else None
+        return Search(keyframe, known, starts, covariance, self._config).result()
 
-    def _near(self, place: Place, *, linked: bool) -> dict[int, Place]:
+    def _near(self, place: Place, *, linked: bool) -> list[Place]:
         """The last place and those that see most of the same, best first, of those that are linked or not."""
         shared = shared_voxels(self.places, place)
         shared[self._last()] = len(place.voxels) + 1
         others = [index for index in shared if self.places[index].linked == linked]
         others.sort(key=lambda index: (-shared[index], index))
-        return {index: self.places[index] for index in others[: self._config.neighbours]}
+        return [self.places[index] for index in others[: self._config.neighbours]]
 
     def _last(self) -> int:
         """The last place, or the one it is tied to."""
