@@ -263,6 +263,29 @@ def test_an_interrupted_merge_leaves_nothing_half_written(world: World, monkeypa
     assert not list(run.out.glob(".tmp-*"))
 
 
+def test_a_folder_that_is_being_replaced_is_never_lost(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupted or killed between taking the old one away and putting the new one there, the old one is back."""
+    run = make_run(world, "cellar", "attic")
+    assert run_command(["merge", str(run.out), "--quiet"], SURFEL_STAGES) == 0
+    before = contents(run.out / "sites")
+    make_run(world, "cellar", "attic", "monday")
+    rename = Path.rename
+
+    def cut(path: Path, target: Path) -> Path:
+        if path.name.startswith(".tmp-") and not path.name.endswith("-old"):
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", cut)
+        assert run_command(["merge", str(run.out), "--quiet"], SURFEL_STAGES) == 130
+    assert contents(run.out / "sites") == before
+    assert not list(run.out.glob(".tmp-*"))
+    (run.out / "sites").rename(run.out / ".tmp-sites-1-old")  # as a kill leaves it
+    assert run_command(["merge", str(run.out), "--log", "cellar", "--log", "attic", "--quiet"], SURFEL_STAGES) == 0
+    assert contents(run.out / "sites") == before
+
+
 def test_a_killed_merge_leaves_nothing_half_written(world: World) -> None:
     """What it leaves is a temporary folder that `clean` removes."""
     run = make_run(world, "cellar", "attic")

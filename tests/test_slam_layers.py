@@ -138,6 +138,19 @@ def test_somebody_who_walked_through_is_forgotten() -> None:
     assert np.isnan(cells.top_m[within(cells, *there)]).all()
 
 
+def test_what_was_seen_as_often_as_seen_through_is_undecided() -> None:
+    """Not unknown: whatever the evidence comes to, something was seen there."""
+    there, somebody = (1.5, 1.55), ((1.5, -0.2, 0.0), (1.8, 0.2, 1.7))
+    for seen, gone in ((3, 4), (2, 3), (1, 1), (4, 5)):
+        layers = Layers(COLUMNS)
+        for world in (*[room(somebody)] * seen, *[room()] * gone, *[room(somebody)] * seen):
+            layers.add(image(world, BEFORE), BEFORE)
+            cells = layers.cells()
+            near = within(cells, there, (-0.15, 0.15))
+            assert np.count_nonzero(near) == 6
+            assert not np.isnan(cells.occupancy[near]).any()
+
+
 def test_a_stray_pixel_makes_neither_an_obstacle_nor_a_height() -> None:
     """It is far from its neighbours; two that lie together are forgotten once others see through them."""
     layers = Layers(COLUMNS)
@@ -281,3 +294,15 @@ def test_the_picture_shows_both_layers() -> None:
     assert picture.shape[1] > 1100
     empty = shown(Layers(COLUMNS).cells())
     assert empty.shape[1] > 1100
+
+
+def test_paths_of_two_logs_are_not_joined() -> None:
+    """No line leads from where the one ended to where the other began."""
+    cells = layers_of(room(BOX), [BEFORE, BEHIND])
+    x, y = np.array([-3.0, -3.0, 3.0, 3.0]), np.array([-2.0, 2.0, 2.0, -2.0])
+    joined, apart = (
+        cv2.imdecode(np.frombuffer(render_layers(cells, path, "two", "", (FREE, OCCUPIED)), np.uint8), 1)
+        for path in (Path(x, y), Path(x, y, (2,)))
+    )
+    ink = [np.count_nonzero(np.abs(one.astype(int) - (106, 0, 214)).max(2) < 30) for one in (joined, apart)]
+    assert ink[1] < 0.75 * ink[0]

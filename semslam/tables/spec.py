@@ -486,7 +486,7 @@ SITES = Table(
             "m, rad",
             "3x3 matrix of that x, y and heading, row by row; empty if it is not known",
         ),
-        _c("keyframes", "int32", "", "keyframes whose place pictures tell"),
+        _c("keyframes", "int32", "", "keyframes of the log in table 16"),
         _c("ties", "int32", "", "pairs that surfaces tie of its keyframes and those of other logs"),
         _c("other", "string", "", "the log on whose site it was laid for the verdict; null if on none", null=True),
         _c(
