@@ -272,7 +272,7 @@ def test_a_folder_that_is_being_replaced_is_never_lost(world: World, monkeypatch
     rename = Path.rename
 
     def cut(path: Path, target: Path) -> Path:
-        if path.name.startswith(".tmp-") and not path.name.endswith("-old"):
+        if path.name.startswith(".tmp-"):
             raise KeyboardInterrupt
         return rename(path, target)
 
@@ -281,13 +281,58 @@ def test_a_folder_that_is_being_replaced_is_never_lost(world: World, monkeypatch
         assert run_command(["merge", str(run.out), "--quiet"], SURFEL_STAGES) == 130
     assert contents(run.out / "sites") == before
     assert not list(run.out.glob(".tmp-*"))
-    (run.out / "sites").rename(run.out / ".tmp-sites-1-old")  # as a kill leaves it
+    (run.out / "sites").rename(run.out / ".sites-before")  # as a kill leaves it
+    assert run_command(["clean", str(run.out)], SURFEL_STAGES) == 0
     assert run_command(["merge", str(run.out), "--log", "cellar", "--log", "attic", "--quiet"], SURFEL_STAGES) == 0
     assert contents(run.out / "sites") == before
 
 
+def test_what_a_merge_did_not_write_is_not_replaced(run: World, capsys: Capture) -> None:
+    """Files of the user's own, folders within the run, a link: each is named, before anything is computed."""
+
+    def told(*arguments: str) -> str:
+        assert run_command(["merge", str(run.out), *arguments], SURFEL_STAGES) == 2
+        return capsys.readouterr().err
+
+    assert run_command(["merge", str(run.out), "--quiet"], SURFEL_STAGES) == 0
+    (run.out / "sites" / "monday" / "notes.txt").write_text("mine")
+    assert "notes.txt` was not written by `semslam merge`" in told()
+    (run.out / "sites" / "monday" / "notes.txt").unlink()
+    before = contents(run.out / "sites")
+    for inside in ("results/maps", "cache/maps", "sites/inner"):
+        assert "lies within output folder" in told("--into", str(run.out / inside))
+    (run.root / "link").symlink_to(run.out / "sites")
+    assert "is a link" in told("--into", str(run.root / "link"))
+    mark = json.loads((run.out / "sites" / "merge.json").read_text())
+    (run.out / "sites" / "merge.json").write_text(json.dumps({**mark, "warnings": 3}))
+    assert run_command(["merge", str(run.out), "--quiet"], SURFEL_STAGES) == 0
+    assert contents(run.out / "sites") == before
+
+
+def test_a_damaged_log_is_not_left_out_in_silence(run: World, capsys: Capture) -> None:
+    """The folder that has it stays as it is; a log whose name is taken is named before anything is computed."""
+    assert run_command(["merge", str(run.out), "--quiet"], SURFEL_STAGES) == 0
+    before = contents(run.out / "sites")
+    (table,) = [path for path in run.out.glob("cache/localize/*/shard-*/places.parquet") if path.stat().st_size][:1]
+    whole = table.read_bytes()
+    table.write_bytes(whole[:-100])
+    assert run_command(["merge", str(run.out)], SURFEL_STAGES) == 1
+    assert "damaged or gone" in capsys.readouterr().err
+    table.write_bytes(whole)
+    record = run.out / "logs" / "monday.json"
+    kept = record.read_bytes()
+    record.write_bytes(kept[:50])
+    assert run_command(["merge", str(run.out)], SURFEL_STAGES) == 1
+    assert "the record of a log, is damaged" in capsys.readouterr().err
+    assert contents(run.out / "sites") == before
+    record.write_bytes(kept)
+    (run.out / "logs" / "map.png.json").write_bytes(kept.replace(b'"monday"', b'"map.png"'))
+    assert run_command(["merge", str(run.out)], SURFEL_STAGES) == 1
+    assert "has the name of a file that a merge writes" in capsys.readouterr().err
+
+
 def test_a_killed_merge_leaves_nothing_half_written(world: World) -> None:
-    """What it leaves is a temporary folder that `clean` removes."""
+    """What it leaves is a temporary folder that the next merge, or `clean`, removes."""
     run = make_run(world, "cellar", "attic")
     command = [sys.executable, "-m", "semslam.pipeline.cli", "merge", str(run.out), "--quiet"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)

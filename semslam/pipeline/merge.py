@@ -15,14 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from semslam.errors import SemslamError, UsageError
+from semslam.errors import SemslamError
 from semslam.geometry.frames import SE2
 from semslam.pipeline.cache import Entry, EntryIndex, key_of, table_files
 from semslam.pipeline.config import Config, load_config, plain
 from semslam.pipeline.context import check_inputs
-from semslam.pipeline.digest import sha256_file
-from semslam.pipeline.files import TEMPORARY, files_below, read_json, remove, write_json
 from semslam.pipeline.folder import OutputFolder
+from semslam.pipeline.merge_folder import MERGE_VERSION, mark, notes_of, recover, refuse, replacing, untouched
 from semslam.pipeline.merge_view import LogRow, MergeReport
 from semslam.pipeline.plan import library_version
 from semslam.pipeline.record import LogRecord, load_records
@@ -38,10 +37,18 @@ from semslam.tables.spec import CELLS, LAYERS, PLACES, POSES, SITES, TRAJECTORY,
 
 ESTIMATOR = "surfel"
 """Whose maps can be merged."""
-MARK = "merge.json"
-MERGE_FORMAT = "semslam-sites"
-MERGE_VERSION = 2
-"""Rises whenever the same logs give other files."""
+_TAKEN = frozenset(
+    f"{name}.{end}"
+    for name, ends in {
+        "map": ("parquet", "png", "yaml", "pgm"),
+        "layers": ("parquet", "png"),
+        "places": ("parquet",),
+        "sites": ("parquet",),
+        "merge": ("json",),
+    }.items()
+    for end in ends
+)
+"""Files of the folder and of a site."""
 _LIBRARIES = ("numpy", "opencv-contrib-python-headless", "gtsam", "small_gicp", "pyarrow")
 _POSE = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad", "verdict")
 
@@ -91,16 +98,16 @@ def merge_run(request: MergeRequest, stages: Sequence[Stage], watch: Watch) -> M
         UsageError: there is no such log, or the folder to write holds something else.
     """
     target = request.target
-    _refuse_foreign(target)
+    refuse(target, request.out)
     with request.out.locked():
-        _recover(target)
+        recover(target)
         sources, notes = _sources(request)
         configs = {name: load_config(stages, stored=source.record.config) for name, source in sources.items()}
         key = _key(sources, configs, stages)
-        if _untouched(target, key):
-            return MergeReport(target, _stored_rows(target), (*notes, *_stored_notes(target)), cached=True)
-        first = configs[next(iter(configs))]
-        return _merged(target, key, sources, _Settings.of(first, stages), notes, watch)
+        if untouched(target, key):
+            return MergeReport(target, _stored_rows(target), (*notes, *notes_of(target)), cached=True)
+        settings = {name: _Settings.of(config, stages) for name, config in configs.items()}
+        return _merged(target, key, sources, settings, notes, watch)
 
 
 @dataclass(frozen=True)
@@ -115,31 +122,40 @@ class _Settings:
         known = {stage.name: config.of(stage) for stage in stages}
         return _Settings(known[POSES.stage], known[TRAJECTORY.stage])
 
+    @property
+    def that_count(self) -> tuple[object, ...]:
+        """Those that a merge looks at."""
+        return self.localize.surfel, self.localize.ok_m, self.localize.ok_rad, self.export
+
 
 def _merged(
     target: Path,
     key: str,
     sources: Mapping[str, Source],
-    settings: _Settings,
+    settings: Mapping[str, _Settings],
     notes: Sequence[str],
     watch: Watch,
 ) -> MergeReport:
     """Do it, and put the folder in place."""
-    grid, drives = _drives(sources)
-    sites = merge(drives, grid, settings.localize.surfel, watch)
-    style = SiteStyle(ESTIMATOR, grid, settings.export)
-    temporary = target.with_name(f"{TEMPORARY}{target.name}-{os.getpid()}")
-    remove(temporary)
-    temporary.mkdir(parents=True)
-    try:
-        warnings = list(_write_sites(temporary, sites, sources, settings.localize, style))
+    first = next(iter(settings))
+    notes = (*notes, *_others_settings(settings, first))
+    tracks = {name: _track(source) for name, source in sources.items()}  # what is damaged is said before the long part
+    with replacing(target) as temporary:
+        grid, drives = _drives(sources)
+        sites = merge(drives, grid, settings[first].localize.surfel, watch)
+        style = SiteStyle(ESTIMATOR, grid, settings[first].export)
+        warnings = list(_write_sites(temporary, sites, tracks, settings[first].localize, style))
         rows = [row for site in sites for row in _rows(site)]
         write_table(temporary / "sites.parquet", SITES, _columns(rows))
-        _mark(temporary, key, warnings)
-        _put(temporary, target)
-    finally:
-        remove(temporary)
+        mark(temporary, key, warnings)
     return MergeReport(target, tuple(rows), (*notes, *warnings), cached=False)
+
+
+def _others_settings(settings: Mapping[str, _Settings], first: str) -> Iterator[str]:
+    """Which logs were run with others than those that count."""
+    for name, one in settings.items():
+        if one.that_count != settings[first].that_count:
+            yield f"`{name}` was run with other settings than `{first}`, whose `[localize]` and `[export]` count here"
 
 
 # --- what there is to merge
@@ -148,14 +164,23 @@ def _merged(
 def _sources(request: MergeRequest) -> tuple[dict[str, Source], list[str]]:
     """The logs that have a map, by name, and what is to be said of the others."""
     records = load_records(request.out.logs)
+    for path in sorted(request.out.logs.glob("[!.]*.json")):
+        if not request.logs and path.stem not in records:
+            raise SemslamError(
+                f"`{path}`, the record of a log, is damaged",
+                hint=f"remove it and run the log again: `semslam run LOG --out {request.out.root}`",
+            )
     if request.logs:
         records = {record.name: record for record in sorted(_named(request), key=lambda record: record.name)}
     index = EntryIndex(request.out.cache)
     sources: dict[str, Source] = {}
     notes: list[str] = []
     for name, record in records.items():
+        _refuse_name(name)
         task = record.tasks.get(f"{PLACES.stage}/{ESTIMATOR}")
         entry = index.find(PLACES.stage, task.key) if task and task.key else None
+        if entry is None and task and task.key and not task.failure:
+            raise _gone(request.out, name)
         if entry is None or not entry.rows.get(PLACES.name):
             failure = f": {task.failure.message}" if task and task.failure else ""
             notes.append(f"`{name}` has no map of `{ESTIMATOR}` and was left out{failure}")
@@ -164,6 +189,22 @@ def _sources(request: MergeRequest) -> tuple[dict[str, Source], list[str]]:
     if len(sources) < 2:
         raise _too_few(request.out, sources, notes)
     return sources, notes
+
+
+def _refuse_name(log: str) -> None:
+    """The folder of a log's site lies among files that have names already, and its tracks among the site's."""
+    if log in _TAKEN:
+        raise SemslamError(
+            f"Log `{log}` has the name of a file that a merge writes",
+            hint="rename the log and run it again, or leave it out: name the others with `--log`",
+        )
+
+
+def _gone(folder: OutputFolder, log: str) -> SemslamError:
+    return SemslamError(
+        f"What `{ESTIMATOR}` made of `{log}` is damaged or gone",
+        hint=f"`semslam verify {folder.root} --remove`, then run the log again: `semslam run LOG --out {folder.root}`",
+    )
 
 
 def _named(request: MergeRequest) -> Iterator[LogRecord]:
@@ -176,7 +217,8 @@ def _too_few(folder: OutputFolder, sources: Mapping[str, Source], notes: Sequenc
     return SemslamError(
         f"Output folder `{folder.root}` has {found} where two or more are needed to merge them",
         details="\n".join(notes),
-        hint=f"`semslam run LOG... --estimator {ESTIMATOR} --out {folder.root}` makes them",
+        hint=f"`semslam run LOG... --estimator {ESTIMATOR} --out {folder.root}` makes them; `--log`, if any, must name "
+        "each",
     )
 
 
@@ -242,12 +284,12 @@ def _key(sources: Mapping[str, Source], configs: Mapping[str, Config], stages: S
 
 
 def _write_sites(
-    folder: Path, sites: Sequence[Site], sources: Mapping[str, Source], bounds: LocalizeConfig, style: SiteStyle
+    folder: Path, sites: Sequence[Site], known: Mapping[str, Sequence[Pose]], bounds: LocalizeConfig, style: SiteStyle
 ) -> Iterator[str]:
     """The folders of all sites; what there is to warn of."""
     for site in sites:
         tracks = [
-            list(track_in(site, number, _track(sources[drive.name]), bounds.ok_m, bounds.ok_rad))
+            list(track_in(site, number, known[drive.name], bounds.ok_m, bounds.ok_rad))
             for number, drive in enumerate(site.drives)
         ]
         name = site.drives[0].name
@@ -282,61 +324,3 @@ def _columns(rows: Sequence[LogRow]) -> dict[str, list[Any]]:
 def _stored_rows(folder: Path) -> tuple[LogRow, ...]:
     rows = TableFiles(SITES, [folder / "sites.parquet"]).read()
     return tuple(LogRow(**dict(zip(rows, values, strict=True))) for values in zip(*rows.values(), strict=True))
-
-
-def _stored_notes(folder: Path) -> list[str]:
-    return list(read_json(folder / MARK)["warnings"])
-
-
-# --- whole or not at all
-
-
-def _mark(folder: Path, key: str, warnings: Sequence[str]) -> None:
-    """Say what the folder was made of, and what lies in it."""
-    mark = {"format": MERGE_FORMAT, "version": MERGE_VERSION, "key": key, "warnings": list(warnings)}
-    write_json(folder / MARK, {**mark, "files": dict(_digests(folder))}, durable=True)
-
-
-def _digests(folder: Path) -> Iterator[tuple[str, str]]:
-    """SHA-256 of all files but the mark."""
-    for path in files_below(folder):
-        if path != folder / MARK:
-            yield str(path.relative_to(folder)), sha256_file(path)
-
-
-def _untouched(folder: Path, key: str) -> bool:
-    """Whether the folder was made of this, and still holds what was written."""
-    mark = read_json(folder / MARK)
-    return isinstance(mark, dict) and mark.get("key") == key and mark.get("files") == dict(_digests(folder))
-
-
-def _refuse_foreign(target: Path) -> None:
-    """What no merge wrote is not ours to replace."""
-    if not target.exists():
-        return
-    mark = read_json(target / MARK) if target.is_dir() else None
-    empty = target.is_dir() and not any(target.iterdir())
-    if not empty and not (isinstance(mark, dict) and mark.get("format") == MERGE_FORMAT):
-        what = "is not empty and no folder of `semslam merge`" if target.is_dir() else "is a file"
-        raise UsageError(f"`{target}` {what}", hint=f"name a new folder, such as `--into {target}_sites`")
-
-
-def _put(temporary: Path, target: Path) -> None:
-    """Rename the folder into place; the one before goes away once the new one is there."""
-    old = target.with_name(f"{TEMPORARY}{target.name}-{os.getpid()}-old")
-    remove(old)
-    try:
-        if target.exists():
-            target.rename(old)
-        temporary.rename(target)
-    except BaseException:
-        _recover(target)
-        raise
-    remove(old)
-
-
-def _recover(target: Path) -> None:
-    """Put the folder back that was about to be replaced when that was cut short."""
-    for old in sorted(target.parent.glob(f"{TEMPORARY}{target.name}-*-old")):
-        if not target.exists():
-            old.rename(target)
