@@ -77,6 +77,27 @@ def test_a_log_that_was_cut_keeps_the_same_pictures() -> None:
     assert [row["frame"] for row in again.rows()] == [row["frame"] for row in estimator.rows()]
 
 
+def test_of_ten_keyframes_a_second_a_few_are_kept() -> None:
+    """Many in a row would be aligned with each other alone; all have poses, and those kept are half a second apart."""
+    step = SE2(0.03, 0.0, 0.04)
+    drive = [SE2(0.0, 0.0, 0.0)]
+    for _ in range(19):
+        drive.append(drive[-1] @ step)
+    steps = [
+        replace(one, stamp_nanos=one.stamp_nanos // 10)
+        for one in observed(make_views(make_room(), drive, noise_m=0.003, noise_rad=0.003))
+    ]
+    estimator = SurfelEstimator(CONFIG, GRID)
+    for one in steps:
+        estimator.step(one)
+    found = estimator.finish()
+    assert len(list(estimator.rows())) <= 6
+    for pose, true in zip(found, drive, strict=True):
+        assert pose.map_from_robot is not None
+        away = true.between(pose.map_from_robot)
+        assert abs(away.x_m) + abs(away.y_m) < 0.03
+
+
 def test_what_is_left_out_is_tied_to_one_that_shows_the_same() -> None:
     """Not to whatever was kept last: that may be in another room by now."""
     places = long_track()._track.places

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from semslam.geometry.frames import SE2, Matrix, planar
 from semslam.slam.health import JUMP_M, JUMP_M_PER_S
-from semslam.slam.surfel.alignment import between
+from semslam.slam.surfel.alignment import between, rotation_vector
 from semslam.slam.surfel.coverage import Coverage
 from semslam.slam.surfel.motion_prior import PAUSE_S, Expected, MotionPrior
 from semslam.slam.surfel.places import Anchor, Keyframe, Place, placed, shared_voxels
@@ -26,6 +26,8 @@ SHORTEST_S = 1e-3
 """Between keyframes; stamps that repeat or run back count as this."""
 _LONGEST_S = 60.0
 """Steps count as no longer than this where a robot's motion is bounded."""
+_SOON_S, _BESIDE_M, _BESIDE_RAD = 0.45, 0.3, 0.3
+"""Less than this after a keyframe that was kept, and no farther from it, the next ones are not."""
 _TOGETHER = 0.3
 """Share of samples that two keyframes have in common which are surely near each other."""
 _WIDER = 9.0
@@ -92,7 +94,7 @@ class Track:
             if motion is not None and seconds <= PAUSE_S:
                 self.prior.learn(motion, seconds, seen, _covariance_in_robot(hessian, before.pose))
         place = placed(keyframe, pose, seconds, motion, linked=True, group=self.group)
-        if keyframe and found.sure and self._shown(keyframe, pose):
+        if keyframe and found.sure and (self._shown(keyframe, pose) or self._just_kept(pose, seconds)):
             place = self._left_out(place, hessian)
         self.recall(place)
         return place
@@ -101,6 +103,18 @@ class Track:
         """Whether keyframes of this group show all that this one does."""
         coverage = self._coverage.get(self.group)
         return coverage is not None and coverage.holds(keyframe.surfels, pose)
+
+    def _just_kept(self, pose: Matrix, seconds: float) -> bool:
+        """Whether a keyframe near by was kept less than half a second ago: many in a row would be aligned with each
+        other alone, and small errors add up."""
+        for last in reversed(self.places):
+            if last.anchor is None:
+                break
+            seconds += last.seconds
+        away = between(last.pose, pose)
+        turn = float(np.linalg.norm(rotation_vector(away[:3, :3])))
+        near = float(np.linalg.norm(away[:3, 3])) < _BESIDE_M and turn < _BESIDE_RAD
+        return seconds < _SOON_S and near and last.linked and last.keyframe is not None and last.group == self.group
 
     def _left_out(self, place: Place, hessian: Floats) -> Place:
         """The same without its pictures, tied to the one of its group that shows most of the same."""
