@@ -62,16 +62,18 @@ def main() -> None:
     parser.add_argument("--svg", type=Path, help="draw the figure there")
     parser.add_argument("--estimator", action="append", choices=ESTIMATORS, help="default: all")
     parser.add_argument("--rate", action="append", type=float, help="default: 10, 2, 1, 0.5, 0.2")
+    parser.add_argument("--peer-until", type=float, default=10.0, help="rate up to which small_gicp runs too")
     args = parser.parse_args()
     rates = sorted(args.rate or RATES_HZ, reverse=True)
     print(machine("small_gicp"))
-    found = {rate: at_rate(rate, args.logs, args.out, args.estimator or ESTIMATORS) for rate in rates}
+    chosen = args.estimator or ESTIMATORS
+    found = {rate: at_rate(rate, args.logs, args.out, chosen, peer=rate <= args.peer_until) for rate in rates}
     tell(found)
     if args.svg:
         draw(found, args.svg)
 
 
-def at_rate(rate: float, logs: Sequence[Path], out: Path, estimators: Sequence[str]) -> dict[str, Point]:
+def at_rate(rate: float, logs: Sequence[Path], out: Path, estimators: Sequence[str], *, peer: bool) -> dict[str, Point]:
     """All methods at one rate."""
     folder = out / f"{rate:g}_hz"
     period = 0.0 if rate >= max(RATES_HZ) else 1.0 / rate
@@ -82,7 +84,8 @@ def at_rate(rate: float, logs: Sequence[Path], out: Path, estimators: Sequence[s
     scores: dict[str, list[Mapping[str, Any]]] = {}
     for line in json.loads(told.stdout)["scores"]:
         scores.setdefault(line["estimator"], []).append(line)
-    scores[PEER] = [vars(one) for one in peer_scores(folder)]
+    if peer:
+        scores[PEER] = [vars(one) for one in peer_scores(folder)]
     return {name: mean(lines) for name, lines in scores.items()}
 
 
@@ -122,7 +125,9 @@ def tell(found: Mapping[float, Mapping[str, Point]]) -> None:
 
 def shown(point: Point | None) -> str:
     """One cell."""
-    if point is None or point.ape_m is None:
+    if point is None:
+        return "-"
+    if point.ape_m is None:
         return "no pose"
     return f"{point.ape_m:.3f} m, {point.de_deg:.2f} deg, worst {point.worst_m:.2f} m, {point.coverage:.0%}"
 
