@@ -162,7 +162,8 @@ def draw(found: Mapping[float, Mapping[str, Point]], path: Path) -> None:
         axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_yscale("log")
     axes[1].set_ylim(0, 104)
-    axes[0].legend(frameon=False, fontsize=8)
+    names, labels = axes[0].get_legend_handles_labels()
+    figure.legend(names, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=8)
     figure.savefig(path, metadata={"Date": None, "Creator": None})
 
 
