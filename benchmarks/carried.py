@@ -74,8 +74,7 @@ def main() -> None:
 def read(tables: LogTables) -> tuple[list[Step], Grid]:
     """All keyframes of a log as an estimator gets them, and what their observations are made of."""
     motion, observations, frames = (TableFiles(table, tables[table.name]) for table in (MOTION, OBSERVATIONS, FRAMES))
-    meta = observations.meta
-    grid = Grid(tuple(meta["classes"]), float(meta["cell_m"]), int(meta["side"]))
+    grid = Grid.of(observations.meta)
     shape = len(grid.classes), grid.side, grid.side
     return list(read_steps(motion, observations, frames, shape, 0, motion.rows)), grid
 

@@ -30,10 +30,11 @@ import numpy as np
 from machine import machine
 from numpy.typing import NDArray
 
-from semslam.geometry.frames import SE2
+from semslam.bench.tracks import true_track
 from semslam.labels import FIRST_OBJECT, FREE_FLOOR, OBSTACLE
 from semslam.tables.parquet import TableFiles
-from semslam.tables.spec import CELLS, HOME_OBJECTS, LAYERS, TRUE_MAP, TRUTH
+from semslam.tables.spec import CELLS, HOME_OBJECTS, LAYERS
+from semslam.tables.true_map import NEVER, read_true_map
 
 TRUE_CELL_M = 0.1
 FREE, OCCUPIED = 0.196, 0.65
@@ -59,8 +60,9 @@ class Truth:
     class_id: NDArray[np.int64]
     visible: _Mask
     cell_m: float
-    folder: Path
-    classes: list[str]
+    homes: Path
+    log: str
+    classes: tuple[str, ...]
 
     @property
     def reach(self) -> int:
@@ -111,19 +113,11 @@ def folders_of(out: Path, estimator: str, logs: list[str] | None) -> list[Path]:
 def truth_of(homes: Path, folder: Path) -> Truth:
     """The home of a log on the grid of its layers."""
     cell_m = float(TableFiles(LAYERS, [folder / "layers.parquet"]).meta["cell_m"])
-    place = homes / "truth" / folder.parent.name
-    table = TableFiles(TRUE_MAP, [place / "true_map.parquet"])
-    grid = next(grid for grid in table.meta["grids"] if grid["cell_m"] == TRUE_CELL_M)
-    rows = {name: np.array(values, object) for name, values in table.read().items()}
-    fine = rows["cell_m"] == TRUE_CELL_M
-    at = rows["row"][fine].astype(int), rows["column"][fine].astype(int)
-    class_id, visible = (np.zeros((grid["rows"], grid["columns"]), kind) for kind in (np.int64, np.bool_))
-    class_id[at] = rows["class_id"][fine].astype(int)
-    visible[at] = [frame is not None for frame in rows["first_seen_frame"][fine]]
+    true = read_true_map(homes / "truth" / folder.parent.name / "true_map.parquet", TRUE_CELL_M)
     times = round(TRUE_CELL_M / cell_m)
-    left, low = (round(grid[name] / cell_m) for name in ("origin_x_m", "origin_y_m"))
-    fine_id, fine_visible = (values.repeat(times, 0).repeat(times, 1) for values in (class_id, visible))
-    return Truth(left, low, fine_id, fine_visible, cell_m, place, list(table.meta["classes"]))
+    left, low = (round(start / cell_m) for start in (true.origin_x_m, true.origin_y_m))
+    class_id, visible = (one.repeat(times, 0).repeat(times, 1) for one in (true.class_ids, true.first_seen != NEVER))
+    return Truth(left, low, class_id, visible, cell_m, homes, folder.parent.name, true.classes)
 
 
 def on_grid(ix: NDArray[np.int64], iy: NDArray[np.int64], chosen: _Mask, truth: Truth) -> tuple[_Mask, int]:
@@ -219,9 +213,9 @@ def tops(homes: Path, folder: Path) -> Iterable[tuple[float, float]]:
 
 def flat_things(truth: Truth) -> Iterable[tuple[_Floats, int, float]]:
     """Outline in the map frame, class and top of each."""
-    first = TableFiles(TRUTH, [truth.folder / "truth.parquet"]).read(["x_m", "y_m", "heading_rad"])
-    map_from_home = SE2(*(first[name][0] for name in ("x_m", "y_m", "heading_rad"))).inverse()
-    rows = TableFiles(HOME_OBJECTS, [truth.folder / "home_objects.parquet"]).read()
+    (first,) = true_track(truth.homes, truth.log, 1).by_stamp().values()
+    map_from_home = first.inverse()
+    rows = TableFiles(HOME_OBJECTS, [truth.homes / "truth" / truth.log / "home_objects.parquet"]).read()
     for label, z_m, height_m, outline in zip(
         *(rows[name] for name in ("label", "z_m", "height_m", "footprint")), strict=True
     ):

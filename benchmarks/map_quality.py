@@ -29,6 +29,7 @@ from machine import machine
 from numpy.typing import NDArray
 
 from semslam.bench.rows import LEAKS
+from semslam.bench.tracks import published_track, true_track
 from semslam.geometry.frames import SE2
 from semslam.geometry.grid import Planes, to_dense
 from semslam.labels import FIRST_OBJECT, FREE_FLOOR, OBSTACLE, UNOBSERVED
@@ -52,7 +53,7 @@ from semslam.slam.paper import PoseGrid, place_observation, pose_field, roi_mask
 from semslam.slam.paper_estimator import open_map, pooling_factor
 from semslam.stages.settings import PaperConfig
 from semslam.tables.parquet import TableFiles
-from semslam.tables.spec import CELLS, OBSERVATIONS, TRAJECTORY, TRUTH
+from semslam.tables.spec import CELLS, OBSERVATIONS
 from semslam.tables.true_map import TrueMap, read_true_map
 
 ESTIMATORS = ("surfel", "paper", "dead_reckoning")
@@ -172,19 +173,12 @@ def logs_of(out: Path, dataset: Path, names: Sequence[str]) -> Iterator[Log]:
         table = TableFiles(OBSERVATIONS, tables[OBSERVATIONS.name])
         rows = table.read(["stamp_nanos", "cells", "weights"])
         sights = list(zip(rows["stamp_nanos"], rows["cells"], rows["weights"], strict=True))
-        truth = TableFiles(TRUTH, [dataset / "truth" / name / "truth.parquet"])
-        true = poses_of(truth)
+        true = true_track(dataset, name).by_stamp()
         start = true[min(true)]
         placed = {stamp: start.between(pose) for stamp, pose in true.items()}
         meta = table.meta
         facts = tuple(meta["classes"]), float(meta["cell_m"]), int(meta["side"])
         yield Log(name, *facts, sights, placed, out / "results" / name)
-
-
-def poses_of(table: TableFiles) -> dict[int, SE2]:
-    """Poses by stamp."""
-    rows = table.read(["stamp_nanos", "x_m", "y_m", "heading_rad"])
-    return {stamp: SE2(*pose) for stamp, *pose in zip(*rows.values(), strict=True)}
 
 
 def scores_of(log: Log, dataset: Path) -> tuple[Scores, Scores]:
@@ -283,7 +277,7 @@ def by_chance(truth: Ids, counted: Mask) -> Layer:
 def paper_maps(log: Log) -> tuple[dict[str, Planes], Mask]:
     """The paper's maps at the poses of surfel (L, H, W), by kind, and the cells that a region of interest reached."""
     config = PaperConfig()
-    poses = poses_of(TableFiles(TRAJECTORY, [log.results / "surfel" / "trajectory.parquet"]))
+    poses = published_track(log.results / "surfel").by_stamp()
     worlds = {f"leaky {leak:.1f}": open_map(replace(config, leak=leak), log.classes, None) for leak in LEAKS}
     worlds[LEARNED] = open_map(config, log.classes, shipped("map_update"))
     grid = PoseGrid(config.headings, config.map_side, config.cell_m)

@@ -26,13 +26,14 @@ from pathlib import Path
 import numpy as np
 from machine import machine
 
+from semslam.bench.tracks import published_track, true_track
 from semslam.geometry.frames import SE2
 from semslam.pipeline.evaluate import compose
 from semslam.pipeline.run_tables import run_tables
 from semslam.slam.surfel.prior import Grid, read_prior
 from semslam.slam.surfel.registration import place_in
 from semslam.tables.parquet import TableFiles
-from semslam.tables.spec import MOTION, PLACES, SPLITS, TRAJECTORY, TRUTH
+from semslam.tables.spec import MOTION, PLACES, SPLITS, TRAJECTORY
 
 OK_M, OK_DEG = 0.1, 2.0
 DRAWS = 200
@@ -82,7 +83,7 @@ def main() -> None:
     sites, seconds = merged(args.run, args.log)
     homes = homes_of(args.homes)
     tell_joins(sites, homes, seconds)
-    known = {log: truth(args.homes, log) for logs in sites.values() for log in logs}
+    known = {log: true_track(args.homes, log).by_stamp() for logs in sites.values() for log in logs}
     rows: dict[str, list[Errors]] = {}
     for site, logs in sites.items():
         if len(logs) > 1:
@@ -151,29 +152,17 @@ def compared(run: Path, site: str, log: str, known: Mapping[str, Poses]) -> Iter
     yield "chance", drawn(true)
 
 
-def truth(homes: Path, log: str) -> Poses:
-    """World_from_robot."""
-    return poses_of(TableFiles(TRUTH, [homes / "truth" / log / "truth.parquet"]).read())
-
-
-def poses_of(rows: Mapping[str, Sequence[float]]) -> Poses:
-    """Of the columns of a table."""
-    values = zip(rows["stamp_nanos"], rows["x_m"], rows["y_m"], rows["heading_rad"], strict=True)
-    return {int(stamp): SE2(x, y, heading) for stamp, x, y, heading in values}
-
-
 def track(folder: Path) -> tuple[Poses, set[int]]:
     """Poses, and the stamps of those that are called ok."""
-    rows = TableFiles(TRAJECTORY, [folder / "trajectory.parquet"]).read()
+    rows = TableFiles(TRAJECTORY, [folder / "trajectory.parquet"]).read(["stamp_nanos", "verdict"])
     called = {stamp for stamp, word in zip(rows["stamp_nanos"], rows["verdict"], strict=True) if word == "ok"}
-    return poses_of(rows), called
+    return published_track(folder).by_stamp(), called
 
 
 def laid(run: Path, log: str, first: str) -> SE2 | None:
     """Where the map of a log lies in that of another; None if that is not sure."""
     paths = [run / "results" / name / "surfel" / "places.parquet" for name in (log, first)]
-    meta = TableFiles(PLACES, paths[:1]).meta
-    grid = Grid(tuple(meta["classes"]), float(meta["cell_m"]), int(meta["side"]))
+    grid = Grid.of(TableFiles(PLACES, paths[:1]).meta)
     own, other = (read_prior(path, grid) for path in paths)
     return place_in(own, other).other_from_own
 
@@ -181,10 +170,8 @@ def laid(run: Path, log: str, first: str) -> SE2 | None:
 def reckoned(run: Path, log: str, true: Poses) -> Poses:
     """What motion alone tells from the true start on."""
     files = run_tables(run, [MOTION], [log])[log][MOTION.name]
-    found = compose(TableFiles(MOTION, files).read())
-    columns = zip(found.stamp_nanos.tolist(), found.x_m, found.y_m, found.heading_rad, strict=True)
     start = true[min(true)]
-    return {stamp: start @ SE2(float(x), float(y), float(heading)) for stamp, x, y, heading in columns}
+    return {stamp: start @ pose for stamp, pose in compose(TableFiles(MOTION, files).read()).by_stamp().items()}
 
 
 def judged(true: Poses, poses: Poses, called: set[int] | None = None) -> Errors:

@@ -22,7 +22,6 @@ from machine import machine
 from numpy.typing import NDArray
 
 from semslam.bench.tracks import true_track
-from semslam.geometry.frames import SE2
 from semslam.slam.objects import centroid
 from semslam.tables.parquet import TableFiles
 from semslam.tables.spec import CELLS, HOME_OBJECTS, OBJECTS
@@ -104,8 +103,8 @@ def objects_of(folder: Path) -> list[Thing]:
 
 def truth_of(homes: Path, log: str) -> list[Thing]:
     """The objects of the home in the log's map frame: that of its first keyframe."""
-    truth = true_track(homes, log, 1)
-    start = SE2(truth.x_m.item(), truth.y_m.item(), truth.heading_rad.item()).inverse().matrix
+    (first,) = true_track(homes, log, 1).by_stamp().values()
+    start = first.inverse().matrix
     rows = TableFiles(HOME_OBJECTS, [homes / "truth" / log / "home_objects.parquet"]).read(["label", "footprint"])
     found = []
     for label, outline in zip(rows["label"], rows["footprint"], strict=True):

@@ -116,14 +116,7 @@ def look(homes: Path, out: Path, log: Log, other: Log, common: Sequence[str]) ->
     path = homes / "logs" / f"{log.name}.mcap"
     subprocess.run([*SEMSLAM, "localize", str(path), "--prior", str(prior), *common], check=True, capture_output=True)
     rows = TableFiles(POSES, run_tables(out, (POSES,), [log.name], "surfel")[log.name][POSES.name]).read()
-    return judged(log, other, rows, truth(homes, log), truth(homes, other))
-
-
-def truth(homes: Path, log: Log) -> dict[int, SE2]:
-    """World_from_robot by stamp."""
-    track = true_track(homes, log.name)
-    columns = (track.stamp_nanos, track.x_m, track.y_m, track.heading_rad)
-    return {stamp: SE2(*pose) for stamp, *pose in zip(*(column.tolist() for column in columns), strict=True)}
+    return judged(log, other, rows, *(true_track(homes, one.name).by_stamp() for one in (log, other)))
 
 
 def judged(log: Log, other: Log, rows: dict[str, list[Any]], own: dict[int, SE2], theirs: dict[int, SE2]) -> Found:

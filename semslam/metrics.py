@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semslam.geometry.frames import SE2
+
 _FLOATS = NDArray[np.float64]
 _DRAWS = 1000
 """Random tracks that `chance` averages over; its APE is then within 0.5 % for 30 frames."""
@@ -37,6 +39,11 @@ class Track:
         kept = ~np.isnan(x)
         frame, stamp = (np.asarray(column, np.int64)[kept] for column in (frames, stamp_nanos))
         return Track(frame, stamp, x[kept], y[kept], heading[kept])
+
+    def by_stamp(self) -> dict[int, SE2]:
+        """Poses by their stamps."""
+        columns = (column.tolist() for column in (self.stamp_nanos, self.x_m, self.y_m, self.heading_rad))
+        return {stamp: SE2(*pose) for stamp, *pose in zip(*columns, strict=True)}
 
 
 @dataclass(frozen=True)

@@ -269,7 +269,7 @@ def test_the_map_server_picture() -> None:
     ix, iy = np.array([-3, -2, 0, 1, 2]), np.array([-2, -2, 1, 1, 1])
     occupancy = np.array([0.05, 0.9, 0.5, math.nan, 0.1])
     nothing, count = np.full(5, math.nan), np.ones(5, np.uint32)
-    found = occupancy_image(LayerCells(ix, iy, occupancy, nothing, nothing, count, count, COLUMNS), 0.196, 0.65, 205)
+    found = occupancy_image(LayerCells(ix, iy, occupancy, nothing, nothing, count, count, COLUMNS, 1), 0.196, 0.65, 205)
     assert found is not None
     picture, corner = found
     assert picture.tolist() == [[205, 205, 205, 205, 205, 254], [205] * 6, [205] * 6, [254, 0, 205, 205, 205, 205]]

@@ -28,7 +28,7 @@ from semslam.pipeline.run import run_logs
 from semslam.stages.contract import Stage
 from semslam.stages.settings import PaperConfig
 from semslam.tables.parquet import TableFiles, made_by
-from semslam.tables.spec import POSES, TRUTH, Table
+from semslam.tables.spec import POSES, TRAJECTORY, TRUTH, Table
 
 
 @dataclass(frozen=True)
@@ -141,6 +141,12 @@ def true_track(dataset: Path, log: str, steps: int | None = None) -> Track:
         raise SemslamError(f"The truth of `{log}` is empty", hint=f"simulate it again: `semslam simulate {dataset}`")
     columns = [rows[name][:steps] for name in ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")]
     return Track.of(*columns)
+
+
+def published_track(folder: Path) -> Track:
+    """The trajectory in a folder of results: `results/LOG/ESTIMATOR`, or `sites/SITE/LOG`."""
+    rows = TableFiles(TRAJECTORY, [folder / "trajectory.parquet"]).read()
+    return Track.of(*(rows[name] for name in ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")))
 
 
 def stored_track(files: Sequence[Path], truth: Track) -> Track:

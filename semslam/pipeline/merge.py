@@ -17,14 +17,14 @@ from typing import Any
 
 from semslam.errors import SemslamError
 from semslam.geometry.frames import SE2
-from semslam.pipeline.cache import Entry, EntryIndex, key_of, table_files
+from semslam.pipeline.cache import Entry, EntryIndex, key_of
 from semslam.pipeline.config import Config, load_config, plain
-from semslam.pipeline.context import check_inputs
 from semslam.pipeline.folder import OutputFolder
 from semslam.pipeline.merge_folder import MERGE_VERSION, mark, notes_of, recover, refuse, replacing, untouched
 from semslam.pipeline.merge_view import LogRow, MergeReport
 from semslam.pipeline.plan import library_version
-from semslam.pipeline.record import LogRecord, load_records
+from semslam.pipeline.record import LogRecord, load_records, task_name
+from semslam.pipeline.run_tables import log_tables
 from semslam.pipeline.site_files import SiteStyle, write_site
 from semslam.pipeline.why import find_record
 from semslam.slam.surfel.merging import Drive, Site, Watch, merge
@@ -57,10 +57,10 @@ _POSE = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad", "verdict")
 class Source:
     """The finished track of a log."""
 
+    out: OutputFolder
+    index: EntryIndex
     record: LogRecord
     entry: Entry
-    folder: Path
-    """Of the entry."""
 
     def open(self, table: Table) -> TableFiles:
         """One of its tables.
@@ -68,9 +68,7 @@ class Source:
         Raises:
             SemslamError: it is damaged.
         """
-        files = table_files(self.folder)[table.name]
-        check_inputs(table.name, self.record.name, files)
-        return TableFiles(table, [Path(file.path) for file in files])
+        return TableFiles(table, log_tables(self.out, self.index, self.record, (table,), ESTIMATOR)[table.name])
 
 
 @dataclass(frozen=True)
@@ -177,7 +175,7 @@ def _sources(request: MergeRequest) -> tuple[dict[str, Source], list[str]]:
     notes: list[str] = []
     for name, record in records.items():
         _refuse_name(name)
-        task = record.tasks.get(f"{PLACES.stage}/{ESTIMATOR}")
+        task = record.tasks.get(task_name(PLACES.stage, ESTIMATOR))
         entry = index.find(PLACES.stage, task.key) if task and task.key else None
         if entry is None and task and task.key and not task.failure:
             raise _gone(request.out, name)
@@ -185,7 +183,7 @@ def _sources(request: MergeRequest) -> tuple[dict[str, Source], list[str]]:
             failure = f": {task.failure.message}" if task and task.failure else ""
             notes.append(f"`{name}` has no map of `{ESTIMATOR}` and was left out{failure}")
         else:
-            sources[name] = Source(record, entry, request.out.stage(PLACES.stage) / entry.key)
+            sources[name] = Source(request.out, index, record, entry)
     if len(sources) < 2:
         raise _too_few(request.out, sources, notes)
     return sources, notes
@@ -229,24 +227,17 @@ def _drives(sources: Mapping[str, Source]) -> tuple[Grid, list[Drive]]:
         SemslamError: they do not, or a table is damaged.
     """
     tables = {name: source.open(PLACES) for name, source in sources.items()}
-    grids = {name: _grid(table.meta) for name, table in tables.items()}
+    grids = {name: Grid.of(table.meta) for name, table in tables.items()}
     first, grid = next(iter(grids.items()))
     for name, other in grids.items():
         if other != grid:
             raise SemslamError(
                 f"Logs `{first}` and `{name}` were made of other observations than each other",
-                details="\n".join(
-                    f"{log}: {one.side} x {one.side} cells of {one.cell_m:g} m, {', '.join(one.classes)}"
-                    for log, one in ((first, grid), (name, other))
-                ),
+                details=f"{first}: {grid.told}\n{name}: {other.told}",
                 hint="run both with the same detector and the same `[extract]`, or name those that belong together "
                 "with `--log`",
             )
     return grid, [Drive(name, tuple(remembered(table, grid, f"`{name}`"))) for name, table in tables.items()]
-
-
-def _grid(meta: Mapping[str, Any]) -> Grid:
-    return Grid(tuple(meta["classes"]), float(meta["cell_m"]), int(meta["side"]))
 
 
 def _track(source: Source) -> list[Pose]:

@@ -9,12 +9,12 @@
       <log>/trajectory.parquet   table 10
       <log>/trajectory.tum
 
-Written by the functions that `export` writes the same files of a single log with.
+The formats, pictures and lines below titles are those of a single log's files, which `export` writes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 
 from semslam.geometry.frames import planar
-from semslam.slam.depth_sight import Columns, DepthImage
-from semslam.slam.exchange import map_yaml, occupancy_image, pgm, tum, unknown_grey
+from semslam.slam.depth_sight import DepthImage
+from semslam.slam.exchange import map_server_files, tum_of
 from semslam.slam.layer_picture import layers_subtitle, render_layers
 from semslam.slam.layers import LayerCells, Layers
-from semslam.slam.picture import MapCells
+from semslam.slam.picture import MapCells, map_subtitle
 from semslam.slam.picture import Path as DrawnPath
 from semslam.slam.render import render_map
 from semslam.slam.surfel.merging import Site
@@ -59,20 +59,19 @@ def write_site(folder: Path, site: Site, tracks: Sequence[Sequence[Pose]], style
     _write_places(folder / "places.parquet", thinned(known), style)
     columns = cells(known, style.grid)
     write_table(folder / "map.parquet", CELLS, columns, style.meta)
-    shown = _map_cells(columns, style.grid)
+    shown = MapCells.of(columns, style.meta)
     for drive, track in zip(site.drives, tracks, strict=True):
         (folder / drive.name).mkdir()
         _write_track(folder / drive.name, track, style)
     path = _drawn(tracks)
-    title, subtitle = _titles(site, shown, len(path.x_m), style)
+    title, subtitle = _title(site), map_subtitle(shown, path, style.estimator)
     (folder / "map.png").write_bytes(render_map(shown, path, title, subtitle, style.export.pixels_per_cell))
     return _write_layers(folder, _layers(known, style.export), path, title, style)
 
 
 def _layers(known: Sequence[Remembered], config: ExportConfig) -> LayerCells:
     """Occupancy and heights from the depth that the map remembers."""
-    low_m, high_m = config.min_obstacle_height_m, config.max_obstacle_height_m
-    layers = Layers(Columns(config.layer_cell_m, low_m, high_m, config.layer_depth_m))
+    layers = Layers.of(config)
     for one in known:
         if one.place.keyframe is not None:
             sight = one.place.keyframe.sight
@@ -84,9 +83,12 @@ def _write_layers(folder: Path, layers: LayerCells, path: DrawnPath, title: str,
     """As table, picture, and for map_server; False if the map is too large for that."""
     write_table(folder / "layers.parquet", LAYERS, layers.rows(), layers.about(style.estimator))
     thresholds = style.export.free_threshold, style.export.occupied_threshold
-    subtitle = layers_subtitle(layers, path, style.estimator)
+    subtitle = layers_subtitle(layers, style.estimator)
     (folder / "layers.png").write_bytes(render_layers(layers, path, title, subtitle, thresholds))
-    return _write_occupancy(folder, layers, style.export)
+    files = map_server_files(layers, *thresholds)
+    for name, content in (files or {}).items():
+        (folder / name).write_bytes(content)
+    return files is not None
 
 
 def _write_places(path: Path, known: Sequence[Remembered], style: SiteStyle) -> None:
@@ -110,26 +112,7 @@ def _write_track(folder: Path, track: Sequence[Pose], style: SiteStyle) -> None:
         "verdict": [row.verdict for row in track],
     }
     write_table(folder / "trajectory.parquet", TRAJECTORY, rows, {"estimator": style.estimator})
-    lines = tum((row.stamp_nanos, row.pose.x_m, row.pose.y_m, row.pose.heading_rad) for row in track)
-    (folder / "trajectory.tum").write_text(lines, encoding="ascii", newline="\n")
-
-
-def _write_occupancy(folder: Path, layers: LayerCells, config: ExportConfig) -> bool:
-    """map.pgm and map.yaml; False if the map is too large for them."""
-    occupied, free = config.occupied_threshold, config.free_threshold
-    found = occupancy_image(layers, free, occupied, unknown_grey(free, occupied))
-    if found is None:
-        return False
-    image, corner = found
-    (folder / "map.pgm").write_bytes(pgm(image))
-    text = map_yaml("map.pgm", config.layer_cell_m, corner, occupied, free)
-    (folder / "map.yaml").write_text(text, encoding="ascii", newline="\n")
-    return True
-
-
-def _map_cells(columns: Mapping[str, Any], grid: Grid) -> MapCells:
-    ix, iy, class_id = (np.array(columns[name], np.int64) for name in ("ix", "iy", "class_id"))
-    return MapCells(ix, iy, class_id, grid.classes, grid.cell_m)
+    (folder / "trajectory.tum").write_bytes(tum_of(rows))
 
 
 def _drawn(tracks: Sequence[Sequence[Pose]]) -> DrawnPath:
@@ -139,9 +122,6 @@ def _drawn(tracks: Sequence[Sequence[Pose]]) -> DrawnPath:
     return DrawnPath(np.array([row.x_m for row in rows]), np.array([row.y_m for row in rows]), tuple(starts))
 
 
-def _titles(site: Site, shown: MapCells, keyframes: int, style: SiteStyle) -> tuple[str, str]:
+def _title(site: Site) -> str:
     others = len(site.drives) - 1
-    title = site.drives[0].name + (f" and {others} more {'log' if others == 1 else 'logs'}" if others else "")
-    cell = f"cell {shown.cell_m:.2f} m"
-    parts = [f"estimator {style.estimator}", f"{keyframes:,} keyframes", cell, f"{len(shown.ix):,} cells"]
-    return title, "  ·  ".join(parts)
+    return site.drives[0].name + (f" and {others} more {'log' if others == 1 else 'logs'}" if others else "")

@@ -34,16 +34,12 @@ from semslam.geometry.grid import Planes
 from semslam.labels import FIRST_OBJECT, FREE_FLOOR, OBSTACLE, UNOBSERVED
 from semslam.slam.belief import Belief, Ids, hulls_of
 from semslam.slam.checkpoint import pack, unpack
+from semslam.slam.tiles import TILE, TilePlace, Window, on_map, tiles_under
 
-TILE = 64
 MIN_BLOB_WEIGHT = 0.1
 MIN_SHARE = 0.1
 HALF_WEIGHT_M = 3.0
 OBJECT_SHARE = 2.0
-LARGEST_M = 1e7
-"""Poses beyond this are off any map; their observations are left out."""
-LARGEST_CELL = 1 << 30
-"""Nor is a cell beyond this on any map: tables hold 32 bits, and an observation reaches farther than its pose."""
 SNAPSHOT_HALF = 1024
 """A snapshot shows at most this many cells either way of the robot."""
 SNAPSHOT_INDICES = 1 << 32
@@ -51,8 +47,6 @@ SNAPSHOT_INDICES = 1 << 32
 
 _Mask = NDArray[np.bool_]
 _Columns = dict[str, NDArray[Any]]
-_Place = tuple[int, int]
-"""Row and column of a tile."""
 
 
 @dataclass(frozen=True)
@@ -100,29 +94,25 @@ class Evidence:
         self._cell_m = cell_m
         self._side = side
         self._weight = _sight_weights(side, cell_m)
-        self._tiles: dict[_Place, _Tile] = {}
-        self._labels: dict[_Place, Ids] = {}
+        self._tiles: dict[TilePlace, _Tile] = {}
+        self._labels: dict[TilePlace, Ids] = {}
         """Of each tile by itself: what has been read since it changed."""
-        self._columns: dict[_Place, _Columns] = {}
+        self._columns: dict[TilePlace, _Columns] = {}
         """The cells of each tile, likewise since it or one beside it changed."""
 
     def add(self, planes: Planes, map_from_robot: SE2, stamp_nanos: int) -> bool:
         """Lay one observation (L, side, side) on the map. False if the pose is too far away to be one."""
-        if not self._holds(map_from_robot):
+        if not on_map(map_from_robot, self._cell_m):
             return False
         seen = np.asarray(planes[1:].any(0))
         if seen.any():
             patch = self._patch(map_from_robot, seen)
             sights = {class_id: mask for class_id, mask in sightings(planes).items() if mask.any()}
-            for place, window, part in self._tiles_under(patch):
-                tile = self._changing(place)
-                _count(tile, window, patch.source[part], seen, sights, self._weight, stamp_nanos)
+            for place, window, part in tiles_under(patch.left, patch.low, patch.source.shape):
+                if (patch.source[part] < self._side**2).any():
+                    tile = self._changing(place)
+                    _count(tile, window, patch.source[part], seen, sights, self._weight, stamp_nanos)
         return True
-
-    def _holds(self, pose: SE2) -> bool:
-        """Whether a pose is near enough to be one. Not so if it is no number."""
-        largest_m = min(LARGEST_M, LARGEST_CELL * self._cell_m)
-        return abs(pose.x_m) < largest_m and abs(pose.y_m) < largest_m
 
     def _patch(self, map_from_robot: SE2, seen: _Mask) -> _Patch:
         """Map cells that the seen part of an observation may cover, with the observation cell under their middles."""
@@ -139,17 +129,7 @@ class Evidence:
         inside = (column >= 0) & (column < self._side) & (row >= 0) & (row < self._side)
         return _Patch(left, low, np.where(inside, row * self._side + column, self._side * self._side))
 
-    def _tiles_under(self, patch: _Patch) -> Iterator[tuple[_Place, tuple[slice, slice], tuple[slice, slice]]]:
-        """Places of tiles that the patch touches, with the window of the tile and the part of the patch that meet."""
-        rows, columns = patch.source.shape
-        for tile_y in range(patch.low // TILE, (patch.low + rows - 1) // TILE + 1):
-            for tile_x in range(patch.left // TILE, (patch.left + columns - 1) // TILE + 1):
-                window_y, part_y = _overlap(tile_y * TILE, patch.low, rows)
-                window_x, part_x = _overlap(tile_x * TILE, patch.left, columns)
-                if (patch.source[part_y, part_x] < self._side**2).any():
-                    yield (tile_y, tile_x), (window_y, window_x), (part_y, part_x)
-
-    def _changing(self, place: _Place) -> _Tile:
+    def _changing(self, place: TilePlace) -> _Tile:
         """The tile there, to be changed: what was read of it, and of those beside it, is forgotten."""
         self._labels.pop(place, None)
         for beside in _around(place):
@@ -166,7 +146,7 @@ class Evidence:
         parts = [_tile_seen(place, tile) for place, tile in sorted(self._tiles.items())]
         return _joined(parts or [_tile_seen((0, 0), _Tile())])
 
-    def _cells_of(self, place: _Place) -> _Columns:
+    def _cells_of(self, place: TilePlace) -> _Columns:
         """The cells of a tile, with what the things that reach into it say."""
         if place not in self._columns:
             inner = slice(TILE, 2 * TILE)
@@ -175,7 +155,7 @@ class Evidence:
             self._columns[place] = _tile_cells(place, self._tiles[place], belief)
         return self._columns[place]
 
-    def _labels_of(self, place: _Place) -> Ids:
+    def _labels_of(self, place: TilePlace) -> Ids:
         """The most probable class of each cell of a tile by itself; *unobserved* where no tile is."""
         if place not in self._tiles:
             return np.full((TILE, TILE), UNOBSERVED, np.uint16)
@@ -188,7 +168,7 @@ class Evidence:
         cells = self.cells()
         ix, iy, class_id = (cells[name].astype(np.int64) for name in ("ix", "iy", "class_id"))
         near = np.zeros(ix.shape, np.bool_)
-        if ix.size and self._holds(around):
+        if ix.size and on_map(around, self._cell_m):
             half = _snapshot_half(int(class_id.max()) + 1)
             middle_x, middle_y = (math.floor(v / self._cell_m) for v in (around.x_m, around.y_m))
             near = (np.abs(ix - middle_x) <= half) & (np.abs(iy - middle_y) <= half)
@@ -256,15 +236,9 @@ def _sight_weights(side: int, cell_m: float) -> NDArray[np.float32]:
     return np.append(weights.ravel(), 0.0).astype(np.float32)
 
 
-def _overlap(tile_start: int, start: int, length: int) -> tuple[slice, slice]:
-    """Where a tile and [start, start + length) meet, seen from the tile and from the other."""
-    first, last = max(tile_start, start), min(tile_start + TILE, start + length)
-    return slice(first - tile_start, last - tile_start), slice(first - start, last - start)
-
-
 def _count(
     tile: _Tile,
-    window: tuple[slice, slice],
+    window: Window,
     source: NDArray[np.int64],
     seen: _Mask,
     sights: dict[int, _Mask],
@@ -283,13 +257,13 @@ def _count(
             tile.weights.setdefault(class_id, np.zeros((TILE, TILE), np.float32))[window] += hit * weight[source]
 
 
-def _rows_around(place: _Place) -> Iterator[list[_Place]]:
+def _rows_around(place: TilePlace) -> Iterator[list[TilePlace]]:
     """Places of the tiles about one, and its own, row by row."""
     for row in range(place[0] - 1, place[0] + 2):
         yield [(row, column) for column in range(place[1] - 1, place[1] + 2)]
 
 
-def _around(place: _Place) -> Iterator[_Place]:
+def _around(place: TilePlace) -> Iterator[TilePlace]:
     return chain.from_iterable(_rows_around(place))
 
 
@@ -305,7 +279,7 @@ def _belief(tile: _Tile) -> Belief:
     return Belief.of(tile.weights, (TILE, TILE))
 
 
-def _tile_cells(place: _Place, tile: _Tile, belief: Belief) -> _Columns:
+def _tile_cells(place: TilePlace, tile: _Tile, belief: Belief) -> _Columns:
     """The cells of a tile in which anything was recognised."""
     labels, probability = belief.told()
     y, x = np.nonzero(labels != UNOBSERVED)
@@ -324,7 +298,7 @@ def _tile_cells(place: _Place, tile: _Tile, belief: Belief) -> _Columns:
     }
 
 
-def _tile_seen(place: _Place, tile: _Tile) -> _Columns:
+def _tile_seen(place: TilePlace, tile: _Tile) -> _Columns:
     """The cells of a tile in which anything was recognised. Of equal weights objects win, then obstacles."""
     ids = [class_id for class_id in sorted(tile.weights) if class_id >= FIRST_OBJECT]
     ids += [class_id for class_id in (OBSTACLE, FREE_FLOOR) if class_id in tile.weights]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,16 @@ from semslam.slam.layers import LayerCells
 MAX_PIXELS = 1 << 26
 """Largest PGM that is written, in cells."""
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
+
+
+def map_server_files(cells: LayerCells, free: float, occupied: float) -> dict[str, bytes] | None:
+    """`map.pgm` and `map.yaml` by name, for these thresholds; None if the map is too large for them."""
+    found = occupancy_image(cells, free, occupied, unknown_grey(free, occupied))
+    if found is None:
+        return None
+    image, corner_m = found
+    text = map_yaml("map.pgm", cells.columns.cell_m, corner_m, occupied, free)
+    return {"map.pgm": pgm(image), "map.yaml": text.encode("ascii")}
 
 
 def occupancy_image(
@@ -85,6 +96,12 @@ def map_yaml(image: str, cell_m: float, corner_m: tuple[float, float], occupied:
         f"occupied_thresh: {occupied:g}\n"
         f"free_thresh: {free:g}\n"
     )
+
+
+def tum_of(track: Mapping[str, Sequence[Any]]) -> bytes:
+    """A TUM file of the columns of the trajectory table."""
+    columns = (track[name] for name in ("stamp_nanos", "x_m", "y_m", "heading_rad"))
+    return tum(zip(*columns, strict=True)).encode("ascii")
 
 
 def tum(poses: Iterable[tuple[int, float, float, float]]) -> str:

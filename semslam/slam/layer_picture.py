@@ -60,12 +60,12 @@ def render_layers(cells: LayerCells, path: Path, title: str, subtitle: str, thre
     return canvas.png()
 
 
-def layers_subtitle(cells: LayerCells, path: Path, estimator: str) -> str:
-    """What the layers were made of."""
+def layers_subtitle(cells: LayerCells, estimator: str) -> str:
+    """What the layers were made of, in a line."""
     columns = cells.columns
     words = [
         f"estimator {estimator}",
-        f"depth of {len(path.posed):,} keyframes",
+        f"depth of {cells.keyframes:,} keyframes",
         f"cell {columns.cell_m:g} m",
         f"obstacles from {columns.low_m:g} to {columns.high_m:g} m",
     ]

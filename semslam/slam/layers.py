@@ -14,8 +14,6 @@ Memory grows with the mapped area, in tiles of 64 x 64 cells, not with time.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,9 +22,9 @@ from numpy.typing import NDArray
 
 from semslam.geometry.frames import SE2
 from semslam.slam.depth_sight import BIN_M, BINS, SLICE_M, Columns, DepthImage, Sight, look
-from semslam.slam.evidence import LARGEST_CELL, LARGEST_M
+from semslam.slam.tiles import TILE, TilePlace, Window, on_map, tiles_under
+from semslam.stages.settings import ExportConfig
 
-TILE = 64
 STEPS = 16
 HIT, PASS = 32, -24
 """Two natural units (probability 0.88) and one and a half (0.18)."""
@@ -52,6 +50,8 @@ class LayerCells:
     points: NDArray[np.uint32]
     views: NDArray[np.uint32]
     columns: Columns
+    keyframes: int
+    """Whose depth was taken up."""
 
     def rows(self) -> dict[str, list[Any]]:
         """Of the layers table."""
@@ -90,7 +90,7 @@ class _Tile:
         self.points = np.zeros((TILE, TILE), np.uint32)
         self.views = np.zeros((TILE, TILE), np.uint32)
 
-    def take(self, window: tuple[slice, slice], sight: Sight, part: tuple[slice, slice]) -> None:
+    def take(self, window: Window, sight: Sight, part: Window) -> None:
         """Add the part of a sight that lies over a window of the tile."""
         rows, columns = part
         change = np.int8(HIT) * sight.hit[:, rows, columns] + np.int8(PASS) * sight.passed[:, rows, columns]
@@ -112,34 +112,28 @@ class Layers:
 
     def __init__(self, columns: Columns) -> None:
         self._columns = columns
-        self._tiles: dict[tuple[int, int], _Tile] = {}
+        self._tiles: dict[TilePlace, _Tile] = {}
+        self._keyframes = 0
+
+    @staticmethod
+    def of(config: ExportConfig) -> Layers:
+        """Empty ones as configured."""
+        low_m, high_m = config.min_obstacle_height_m, config.max_obstacle_height_m
+        return Layers(Columns(config.layer_cell_m, low_m, high_m, config.layer_depth_m))
 
     def add(self, image: DepthImage, map_from_robot: SE2) -> bool:
         """Take up one keyframe. False if its pose is too far away to be one."""
-        if not self._holds(map_from_robot):
+        if not on_map(map_from_robot, self._columns.cell_m):
             return False
         sight = look(image, map_from_robot, self._columns)
         if sight is not None:
-            for tile, window, part in self._tiles_under(sight):
-                tile.take(window, sight, part)
+            for place, window, part in tiles_under(sight.left, sight.low, sight.seen.shape):
+                if sight.seen[part].any():
+                    if place not in self._tiles:
+                        self._tiles[place] = _Tile(self._columns)
+                    self._tiles[place].take(window, sight, part)
+        self._keyframes += 1
         return True
-
-    def _holds(self, pose: SE2) -> bool:
-        """Whether a pose is near enough to be one. Not so if it is no number."""
-        largest_m = min(LARGEST_M, LARGEST_CELL * self._columns.cell_m)
-        return abs(pose.x_m) < largest_m and abs(pose.y_m) < largest_m and math.isfinite(pose.heading_rad)
-
-    def _tiles_under(self, sight: Sight) -> Iterator[tuple[_Tile, tuple[slice, slice], tuple[slice, slice]]]:
-        """Tiles of which something was seen, with the window of the tile and the part of the sight that meet."""
-        rows, columns = sight.seen.shape
-        for tile_y in range(sight.low // TILE, (sight.low + rows - 1) // TILE + 1):
-            for tile_x in range(sight.left // TILE, (sight.left + columns - 1) // TILE + 1):
-                window_y, part_y = _overlap(tile_y * TILE, sight.low, rows)
-                window_x, part_x = _overlap(tile_x * TILE, sight.left, columns)
-                if sight.seen[part_y, part_x].any():
-                    if (tile_y, tile_x) not in self._tiles:
-                        self._tiles[tile_y, tile_x] = _Tile(self._columns)
-                    yield self._tiles[tile_y, tile_x], (window_y, window_x), (part_y, part_x)
 
     def cells(self) -> LayerCells:
         """All cells of which anything is known."""
@@ -148,13 +142,7 @@ class Layers:
         whole = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
         order = np.lexsort((whole[0], whole[1]))
         ix, iy, occupancy, floor_m, top_m, points, views = (field[order] for field in whole)
-        return LayerCells(ix, iy, occupancy, floor_m, top_m, points, views, self._columns)
-
-
-def _overlap(tile_start: int, start: int, length: int) -> tuple[slice, slice]:
-    """Where a tile and [start, start + length) meet, seen from the tile and from the other."""
-    first, last = max(tile_start, start), min(tile_start + TILE, start + length)
-    return slice(first - tile_start, last - tile_start), slice(first - start, last - start)
+        return LayerCells(ix, iy, occupancy, floor_m, top_m, points, views, self._columns, self._keyframes)
 
 
 def _known(place: tuple[int, int], tile: _Tile, columns: Columns) -> tuple[NDArray[Any], ...]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,12 @@ class MapCells:
     class_id: NDArray[np.int64]
     classes: tuple[str, ...]
     cell_m: float
+
+    @staticmethod
+    def of(rows: Mapping[str, Sequence[Any]], meta: Mapping[str, Any]) -> MapCells:
+        """Of the columns of a cells table and what it says of itself."""
+        ix, iy, class_id = (np.array(rows[name], np.int64) for name in ("ix", "iy", "class_id"))
+        return MapCells(ix, iy, class_id, tuple(meta["classes"]), float(meta["cell_m"]))
 
     def objects(self) -> list[int]:
         """Object classes on the map, most cells first, then by class id."""
@@ -54,3 +62,12 @@ class Path:
     def length_m(self) -> float:
         """From known position to known position of one log."""
         return float(sum(np.hypot(*np.diff(part.posed, axis=0).T).sum() for part in self.parts))
+
+
+def map_subtitle(cells: MapCells, path: Path, estimator: str) -> str:
+    """What a map was made of, in a line."""
+    keyframes = f"{len(path.x_m):,} keyframes"
+    posed = len(path.posed)
+    if posed < len(path.x_m):
+        keyframes += f", {posed:,} with a pose"
+    return "  ·  ".join([f"estimator {estimator}", keyframes, f"cell {cells.cell_m:.2f} m", f"{len(cells.ix):,} cells"])

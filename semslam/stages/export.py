@@ -28,14 +28,14 @@ import numpy as np
 from semslam.geometry import rle
 from semslam.geometry.frames import SE2
 from semslam.geometry.projection import flying, main_body, points_in_robot
-from semslam.slam.depth_sight import Columns, DepthImage
-from semslam.slam.evidence import LARGEST_M
-from semslam.slam.exchange import MAX_PIXELS, map_yaml, occupancy_image, pgm, tum, unknown_grey
+from semslam.slam.depth_sight import DepthImage
+from semslam.slam.exchange import MAX_PIXELS, map_server_files, tum_of
 from semslam.slam.layer_picture import layers_subtitle, render_layers
 from semslam.slam.layers import LayerCells, Layers
 from semslam.slam.objects import Patch, things
-from semslam.slam.picture import MapCells, Path
+from semslam.slam.picture import MapCells, Path, map_subtitle
 from semslam.slam.render import render_map
+from semslam.slam.tiles import LARGEST_M
 from semslam.stages.contract import ShardWriter, StageContext, TableSource
 from semslam.stages.settings import ExportConfig
 from semslam.tables.parquet import TableFileWriter, rows_of, write_table
@@ -57,13 +57,13 @@ def run(ctx: StageContext) -> None:
     config: ExportConfig = ctx.config
     poses, cells = ctx.read(POSES), ctx.read(CELLS)
     track, rows = poses.read(_POSE), cells.read()
-    shown, placed = _map_cells(rows, cells.meta), _placed(track)
+    shown, placed = MapCells.of(rows, cells.meta), _placed(track)
     path = Path(np.array(track["x_m"], np.float64), np.array(track["y_m"], np.float64))
     with ctx.shard(0) as shard:
         _write_trajectory(shard, track, poses)
         write_table(shard.path("map.parquet"), CELLS, rows, dict(cells.meta))
         estimator = str(cells.meta["estimator"])
-        subtitle = _subtitle(estimator, path, shown)
+        subtitle = map_subtitle(shown, path, estimator)
         shard.path("map.png").write_bytes(render_map(shown, path, ctx.log, subtitle, config.pixels_per_cell))
         ctx.progress(3, _FILES)
         layers = _layers(ctx, placed, config)
@@ -71,7 +71,7 @@ def run(ctx: StageContext) -> None:
         ctx.progress(4, _FILES)
         _write_occupancy(shard, layers, config)
         ctx.progress(6, _FILES)
-        subtitle = layers_subtitle(layers, path, estimator)
+        subtitle = layers_subtitle(layers, estimator)
         thresholds = config.free_threshold, config.occupied_threshold
         shard.path("layers.png").write_bytes(render_layers(layers, path, ctx.log, subtitle, thresholds))
         _write_places(ctx, shard)
@@ -162,24 +162,17 @@ def _patches_of(
             yield patch
 
 
-def _map_cells(rows: _Table, meta: Mapping[str, Any]) -> MapCells:
-    ix, iy, class_id = (np.array(rows[name], np.int64) for name in ("ix", "iy", "class_id"))
-    return MapCells(ix, iy, class_id, tuple(meta["classes"]), float(meta["cell_m"]))
-
-
 def _write_trajectory(shard: ShardWriter, track: _Table, poses: TableSource) -> None:
     """The keyframes with a pose, as table and as TUM file."""
     kept = [i for i, x in enumerate(track["x_m"]) if x is not None]
     posed = {name: [track[name][i] for i in kept] for name in _POSE}
     shard.table(TRAJECTORY, dict(poses.meta)).append(posed)
-    lines = tum(zip(*(posed[name] for name in _POSE[1:-1]), strict=True))
-    shard.path("trajectory.tum").write_text(lines, encoding="ascii", newline="\n")
+    shard.path("trajectory.tum").write_bytes(tum_of(posed))
 
 
 def _layers(ctx: StageContext, poses: Mapping[int, SE2], config: ExportConfig) -> LayerCells:
     """Occupancy and heights from the depth of all keyframes with a pose."""
-    low_m, high_m = config.min_obstacle_height_m, config.max_obstacle_height_m
-    layers = Layers(Columns(config.layer_cell_m, low_m, high_m, config.layer_depth_m))
+    layers = Layers.of(config)
     for picture in rows_of(ctx.read(FRAMES).batches(_PICTURE, batch_rows=8)):
         if picture["frame"] in poses:
             fx, fy, cx, cy = (picture[name] for name in ("fx", "fy", "cx", "cy"))
@@ -191,23 +184,12 @@ def _layers(ctx: StageContext, poses: Mapping[int, SE2], config: ExportConfig) -
 
 def _write_occupancy(shard: ShardWriter, cells: LayerCells, config: ExportConfig) -> None:
     """map.pgm and map.yaml."""
-    occupied, free = config.occupied_threshold, config.free_threshold
-    found = occupancy_image(cells, free, occupied, unknown_grey(free, occupied))
-    if found is None:
+    files = map_server_files(cells, config.free_threshold, config.occupied_threshold)
+    if files is None:
         shard.warn(
             f"The map spans more than {MAX_PIXELS:,} cells; `map.pgm` and `map.yaml` were left out. "
             "A jump in the poses is the usual reason: look at `map.png`."
         )
         return
-    image, corner = found
-    shard.path("map.pgm").write_bytes(pgm(image))
-    text = map_yaml("map.pgm", config.layer_cell_m, corner, occupied, free)
-    shard.path("map.yaml").write_text(text, encoding="ascii", newline="\n")
-
-
-def _subtitle(estimator: str, path: Path, cells: MapCells) -> str:
-    keyframes = f"{len(path.x_m):,} keyframes"
-    posed = len(path.posed)
-    if posed < len(path.x_m):
-        keyframes += f", {posed:,} with a pose"
-    return "  ·  ".join([f"estimator {estimator}", keyframes, f"cell {cells.cell_m:.2f} m", f"{len(cells.ix):,} cells"])
+    for name, content in files.items():
+        shard.path(name).write_bytes(content)

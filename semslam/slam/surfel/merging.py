@@ -27,6 +27,7 @@ from semslam.slam.surfel.prior import Grid, Remembered, submap_of
 from semslam.slam.surfel.registration import AMBIGUOUS, FOUND, LOST, Placement, Submap, place_in
 from semslam.slam.surfel.semantic_field import candidates
 from semslam.slam.surfel.smoothing import Smoothed, smooth
+from semslam.slam.surfel.uncertainty import lever
 from semslam.stages.settings import SurfelConfig
 
 Floats = NDArray[np.float64]
@@ -96,11 +97,9 @@ class Site:
         """Covariance (3, 3) of `map_pose`, which has that of the first keyframe; None if that is not known."""
         if not self.covariances[number]:
             return None
-        lever = np.eye(3)
-        away = self.map_pose(number)
-        there = planar(self.poses[number][0])
-        lever[:2, 2] = there.y_m - away.y_m, away.x_m - there.x_m
-        return np.asarray(lever @ self.covariances[number][0] @ lever.T)
+        origin, robot = self.map_pose(number), planar(self.poses[number][0])
+        arm = lever(origin.x_m - robot.x_m, origin.y_m - robot.y_m)
+        return np.asarray(arm @ self.covariances[number][0] @ arm.T)
 
 
 Watch = Callable[[str, int, int], None]

@@ -5,7 +5,7 @@ A reader needs nothing else: the semantic map is laid out again from the observa
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,16 @@ class Grid:
     classes: tuple[str, ...]
     cell_m: float
     side: int
+
+    @staticmethod
+    def of(meta: Mapping[str, Any]) -> Grid:
+        """That of a table, by what it says of itself; KeyError, TypeError or ValueError if it does not."""
+        return Grid(tuple(meta["classes"]), float(meta["cell_m"]), int(meta["side"]))
+
+    @property
+    def told(self) -> str:
+        """For messages."""
+        return f"{self.side} x {self.side} cells of {self.cell_m:g} m, {', '.join(self.classes)}"
 
     def dense(self, seen: Seen) -> Planes | None:
         """(L, side, side); None if nothing was observed."""
@@ -142,7 +152,7 @@ def open_prior(path: Path, grid: Grid) -> TableFiles:
     with made_by(_COMMAND):
         table = TableFiles(PLACES, [path])
     try:
-        theirs = Grid(tuple(table.meta["classes"]), float(table.meta["cell_m"]), int(table.meta["side"]))
+        theirs = Grid.of(table.meta)
     except (KeyError, TypeError, ValueError) as error:
         raise SemslamError(
             f"Map `{path}` does not say what its observations are made of", hint="make it again with this semslam"
@@ -150,10 +160,7 @@ def open_prior(path: Path, grid: Grid) -> TableFiles:
     if theirs != grid:
         raise SemslamError(
             f"Map `{path}` was made of other observations than this log",
-            details="\n".join(
-                f"{name}: {one.side} x {one.side} cells of {one.cell_m:g} m, {', '.join(one.classes)}"
-                for name, one in (("map", theirs), ("log", grid))
-            ),
+            details=f"map: {theirs.told}\nlog: {grid.told}",
             hint="run both logs with the same detector and the same `[extract]`",
         )
     return table

@@ -4,14 +4,14 @@ tracks of its logs.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from semslam.geometry.frames import SE2, planar
+from semslam.geometry.frames import SE2, planar, wrap_angles
 from semslam.slam.estimator import VISUAL, PoseEstimate
 from semslam.slam.evidence import Evidence
 from semslam.slam.surfel.merging import Site
@@ -72,14 +72,19 @@ def thinned(known: Sequence[Remembered], most: int = MOST_KEYFRAMES) -> list[Rem
 
 def _distinct(poses: Sequence[SE2], alike_m: float) -> list[int]:
     """Numbers of poses, without those that have enough like them before them."""
-    places, headings = np.array([[one.x_m, one.y_m] for one in poses]), np.array([one.heading_rad for one in poses])
+    places = _columns(poses)
     kept: list[int] = []
     for index in range(len(poses)):
-        away = np.hypot(*(places[kept] - places[index]).T)
-        turned = np.abs(np.remainder(headings[kept] - headings[index] + math.pi, math.tau) - math.pi)
-        if np.count_nonzero((away < alike_m) & (turned < _ALIKE_RAD)) < _ENOUGH:
+        away = places[kept] - places[index]
+        near = (np.hypot(away[:, 0], away[:, 1]) < alike_m) & (np.abs(wrap_angles(away[:, 2])) < _ALIKE_RAD)
+        if np.count_nonzero(near) < _ENOUGH:
             kept.append(index)
     return kept
+
+
+def _columns(poses: Sequence[SE2]) -> NDArray[np.float64]:
+    """(N, 3): x, y and heading."""
+    return np.array([[one.x_m, one.y_m, one.heading_rad] for one in poses])
 
 
 def track_in(site: Site, number: int, own: Sequence[Pose], ok_m: float, ok_rad: float) -> Iterator[Pose]:
@@ -89,7 +94,7 @@ def track_in(site: Site, number: int, own: Sequence[Pose], ok_m: float, ok_rad: 
     pose is nearest, and keep their verdict.
     """
     known, poses, errors = site.drives[number].known, site.poses[number], site.covariances[number]
-    places = [planar(one.place.pose) for one in known]
+    places = _columns([planar(one.place.pose) for one in known])
     numbers = {one.frame: index for index, one in enumerate(known)}
     for row in own:
         index = numbers.get(row.frame)
@@ -102,7 +107,7 @@ def track_in(site: Site, number: int, own: Sequence[Pose], ok_m: float, ok_rad: 
         yield replace(row, pose=shift @ row.pose, verdict=verdict)
 
 
-def _nearest(places: Sequence[SE2], pose: SE2) -> int:
-    """Number of the pose that is nearest, a radian counting as a metre; the first of several."""
-    away = [pose.between(place) for place in places]
-    return min(range(len(away)), key=lambda i: math.hypot(away[i].x_m, away[i].y_m) + abs(away[i].heading_rad))
+def _nearest(places: NDArray[np.float64], pose: SE2) -> int:
+    """Number of the pose (N, 3: x, y, heading) that is nearest, a radian counting as a metre; the first of several."""
+    away_m = np.hypot(places[:, 0] - pose.x_m, places[:, 1] - pose.y_m)
+    return int(np.argmin(away_m + np.abs(wrap_angles(places[:, 2] - pose.heading_rad))))
