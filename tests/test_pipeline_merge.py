@@ -240,25 +240,35 @@ def test_a_site_is_a_folder_with_a_map_and_the_tracks(run: World, capsys: Captur
     again = json.loads(capsys.readouterr().out)
     assert calls == []
     assert {**again, "cached": False} == told
+    assert run_command(["verify", str(run.out)], SURFEL_STAGES) == 0
     (folder / "monday" / "map.png").write_bytes(b"scribbled over")
+    (folder / "monday" / "map.yaml").unlink()
+    capsys.readouterr()
+    assert run_command(["verify", str(run.out)], SURFEL_STAGES) == 1
+    said = capsys.readouterr().out
+    assert f"{folder / 'monday' / 'map.png'}: damaged" in said
+    assert f"{folder / 'monday' / 'map.yaml'}: missing; `semslam merge {run.out}` makes it anew" in said
     assert run_command(["merge", str(run.out), "--quiet"], SURFEL_STAGES) == 0
     assert contents(folder) == first
 
 
-def test_an_interrupted_merge_leaves_nothing_half_written(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor does it harm the folder that was there."""
+def test_an_interrupted_merge_leaves_nothing_half_written(
+    world: World, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    """Nor does it harm the folder that was there, nor promise to go on where it was."""
     run = make_run(world, "cellar", "attic")
     assert run_command(["merge", str(run.out), "--quiet"], SURFEL_STAGES) == 0
     make_run(world, "cellar", "attic", "monday")
     before = contents(run.out / "sites")
 
-    def write(folder: Path, *_: object) -> bool:
+    def write(folder: Path, *_: object) -> str:
         folder.mkdir()
         (folder / "map.png").write_bytes(b"half")
         raise KeyboardInterrupt
 
     monkeypatch.setattr(merge_module, "write_site", write)
     assert run_command(["merge", str(run.out), "--quiet"], SURFEL_STAGES) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "interrupted: nothing was changed; the same command starts anew"
     assert contents(run.out / "sites") == before
     assert not list(run.out.glob(".tmp-*"))
 

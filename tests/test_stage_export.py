@@ -157,6 +157,15 @@ def test_map_server_files(tmp_path: Path) -> None:
     assert grey(2.4, 0.02) == 205
 
 
+def test_a_map_without_anything_known_is_warned_of(tmp_path: Path) -> None:
+    """Depth is cut off before the board: one unknown cell, with the setting that did it."""
+    context = exported(tmp_path, POSE_LIST[:1], CELL_LIST, ExportConfig(layer_depth_m=0.1))
+    image = cv2.imread(str(context.folder / "shard-0" / "map.pgm"), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    assert image.tolist() == [[205]]
+    assert "up to 0.1 m (`export.layer_depth_m`)" in context.shards[0].warnings[0]
+
+
 def test_layers_lie_on_the_map_at_the_poses(tmp_path: Path) -> None:
     """Rows by row and column, heights of the board, null where nothing is known; metadata as it should be."""
     poses = [(1.0, 2.0, math.pi / 2), None]

@@ -106,7 +106,7 @@ def _plain_words(error: OSError) -> SemslamError:
     if out_of_space(error):
         return SemslamError(f"No space left{where}", hint="free some space, then run the same command again")
     if isinstance(error, PermissionError) or error.errno == errno.EROFS:
-        hint = "look at the permissions with `ls -ld`, or name another folder with `--out`"
+        hint = "look at the permissions with `ls -ld`, or name another folder"
     else:
         hint = "check the path and the disk it lies on"
     return SemslamError(f"{error.strerror or error}{where}", hint=hint)
@@ -449,6 +449,9 @@ def merge(
     view = MergeView(console)
     try:
         report = merge_run(MergeRequest(open_folder(out), logs, into), _stages(context), view.progressed)
+    except KeyboardInterrupt:
+        _complain("interrupted: nothing was changed; the same command starts anew")
+        context.exit(INTERRUPTED)
     finally:
         view.close()
     say_merged(console, report)

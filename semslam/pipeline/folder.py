@@ -64,6 +64,11 @@ class OutputFolder:
         return self.root / "results"
 
     @property
+    def sites(self) -> Path:
+        """What a merge writes, if it is not told where."""
+        return self.root / "sites"
+
+    @property
     def config(self) -> Path:
         """Configuration of the last run."""
         return self.root / "config.json"

@@ -84,7 +84,7 @@ class MergeRequest:
     @property
     def target(self) -> Path:
         """The folder that is written."""
-        return Path(os.path.abspath(self.into or self.out.root / "sites"))
+        return Path(os.path.abspath(self.into or self.out.sites))
 
 
 def merge_run(request: MergeRequest, stages: Sequence[Stage], watch: Watch) -> MergeReport:
@@ -284,8 +284,9 @@ def _write_sites(
             for number, drive in enumerate(site.drives)
         ]
         name = site.drives[0].name
-        if not write_site(folder / name, site, tracks, style):
-            yield f"the map of site `{name}` is too large for map_server; `map.pgm` and `map.yaml` were left out"
+        doubt = write_site(folder / name, site, tracks, style)
+        if doubt:
+            yield f"site `{name}`: {doubt}"
 
 
 def _rows(site: Site) -> Iterator[LogRow]:

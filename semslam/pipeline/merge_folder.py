@@ -31,6 +31,9 @@ def replacing(target: Path) -> Iterator[Path]:
     try:
         yield temporary
         _put(temporary, target)
+    except OSError as error:
+        error.filename = error.filename or str(target)
+        raise
     finally:
         remove(temporary)
 
@@ -49,6 +52,25 @@ def untouched(folder: Path, key: str) -> bool:
     return known.get("files") == dict(_digests(folder))
 
 
+def changed(folder: Path) -> Iterator[tuple[Path, str]]:
+    """Files of a finished folder that are not what was written, and what is wrong with each; none if no merge wrote
+    there."""
+    known = read_json(folder / MARK)
+    if not (folder / MARK).exists():
+        return
+    if not isinstance(known, dict) or not isinstance(known.get("files"), dict):
+        yield folder / MARK, "damaged"
+        return
+    written, found = known["files"], dict(_digests(folder))
+    for name in sorted({*written, *found}):
+        if name not in found:
+            yield folder / name, "missing"
+        elif name not in written:
+            yield folder / name, "nobody stored it here"
+        elif written[name] != found[name]:
+            yield folder / name, "damaged: its content is not what was stored"
+
+
 def notes_of(folder: Path) -> list[str]:
     """The warnings of an untouched folder."""
     known = read_json(folder / MARK)
@@ -61,7 +83,7 @@ def refuse(target: Path, out: OutputFolder) -> None:
     Raises:
         UsageError: there is something else, or the folder would lie within that of the run.
     """
-    own = out.root.resolve() / "sites"
+    own = out.sites.parent.resolve() / out.sites.name
     inside = target.resolve()
     if inside != own and inside.is_relative_to(out.root.resolve()):
         raise UsageError(f"`{target}` lies within output folder `{out.root}`", hint=f"leave `--into` out for `{own}`")

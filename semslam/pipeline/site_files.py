@@ -23,7 +23,7 @@ import numpy as np
 
 from semslam.geometry.frames import planar
 from semslam.slam.depth_sight import DepthImage
-from semslam.slam.exchange import map_server_files, tum_of
+from semslam.slam.exchange import map_server_doubt, map_server_files, tum_of
 from semslam.slam.layer_picture import layers_subtitle, render_layers
 from semslam.slam.layers import LayerCells, Layers
 from semslam.slam.picture import MapCells, map_subtitle
@@ -51,9 +51,9 @@ class SiteStyle:
         return {"classes": list(self.grid.classes), "cell_m": self.grid.cell_m, "estimator": self.estimator}
 
 
-def write_site(folder: Path, site: Site, tracks: Sequence[Sequence[Pose]], style: SiteStyle) -> bool:
-    """Write all files of a site into a new folder, `tracks` of its logs among them; False if the map is too large for
-    map_server and those two files were left out."""
+def write_site(folder: Path, site: Site, tracks: Sequence[Sequence[Pose]], style: SiteStyle) -> str:
+    """Write all files of a site into a new folder, `tracks` of its logs among them; what there is to warn of, or
+    nothing."""
     folder.mkdir()
     known = remembered(site)
     _write_places(folder / "places.parquet", thinned(known), style)
@@ -79,16 +79,15 @@ def _layers(known: Sequence[Remembered], config: ExportConfig) -> LayerCells:
     return layers.cells()
 
 
-def _write_layers(folder: Path, layers: LayerCells, path: DrawnPath, title: str, style: SiteStyle) -> bool:
-    """As table, picture, and for map_server; False if the map is too large for that."""
+def _write_layers(folder: Path, layers: LayerCells, path: DrawnPath, title: str, style: SiteStyle) -> str:
+    """As table, picture, and for map_server; what there is to warn of, or nothing."""
     write_table(folder / "layers.parquet", LAYERS, layers.rows(), layers.about(style.estimator))
     thresholds = style.export.free_threshold, style.export.occupied_threshold
     subtitle = layers_subtitle(layers, style.estimator)
     (folder / "layers.png").write_bytes(render_layers(layers, path, title, subtitle, thresholds))
-    files = map_server_files(layers, *thresholds)
-    for name, content in (files or {}).items():
+    for name, content in map_server_files(layers, *thresholds).items():
         (folder / name).write_bytes(content)
-    return files is not None
+    return map_server_doubt(layers)
 
 
 def _write_places(path: Path, known: Sequence[Remembered], style: SiteStyle) -> None:

@@ -1,8 +1,8 @@
 """Does what is stored still say what it said? Hashes every file again; on request makes every result again.
 
 Checked: the digest that each manifest carries of itself, its key against its components, the chain of its shards, size
-and SHA-256 of every file, files that should not be there, results against the entries they were copied from, and
-whether every result that a log refers to exists.
+and SHA-256 of every file, files that should not be there, results against the entries they were copied from, whether
+every result that a log refers to exists, and the folder of a merge.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from semslam.pipeline.digest import sha256_file
 from semslam.pipeline.discover import Log
 from semslam.pipeline.files import TEMPORARY, canonical_json, files_below, remove, size_bytes
 from semslam.pipeline.folder import OutputFolder, create_folder
+from semslam.pipeline.merge_folder import changed
 from semslam.pipeline.plan import changes
 from semslam.pipeline.record import LogRecord, load_records
 from semslam.pipeline.results import published_key, result_names
@@ -121,6 +122,7 @@ def verify(folder: OutputFolder, seen: Callable[[int], None]) -> VerifyReport:
     folders = list(entry_folders(folder.cache))
     findings = [finding for path in folders for finding in _check_entry(path, seen)]
     findings += _check_records(folder)
+    findings += _check_sites(folder)
     files = sum(1 for path in folders for _ in files_below(path))
     return VerifyReport(len(folders), files, 0, tuple(findings))
 
@@ -200,6 +202,12 @@ def _check_records(folder: OutputFolder) -> Iterator[Finding]:
                 yield Finding(f"{name} {task}", "its result is gone or damaged; the next run makes it anew")
             elif entry is not None and (folder.results / name / variant).is_dir():
                 yield from _check_results(folder, name, variant, entry)
+
+
+def _check_sites(folder: OutputFolder) -> Iterator[Finding]:
+    """What a merge wrote beside the results."""
+    for path, what in changed(folder.sites):
+        yield Finding(str(path), f"{what}; `semslam merge {folder.root}` makes it anew")
 
 
 def _check_results(folder: OutputFolder, log: str, variant: str, entry: Entry) -> Iterator[Finding]:

@@ -17,14 +17,29 @@ MAX_PIXELS = 1 << 26
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 
 
-def map_server_files(cells: LayerCells, free: float, occupied: float) -> dict[str, bytes] | None:
-    """`map.pgm` and `map.yaml` by name, for these thresholds; None if the map is too large for them."""
+def map_server_files(cells: LayerCells, free: float, occupied: float) -> dict[str, bytes]:
+    """`map.pgm` and `map.yaml` by name, for these thresholds; none if the map is too large for them."""
     found = occupancy_image(cells, free, occupied, unknown_grey(free, occupied))
     if found is None:
-        return None
+        return {}
     image, corner_m = found
     text = map_yaml("map.pgm", cells.columns.cell_m, corner_m, occupied, free)
     return {"map.pgm": pgm(image), "map.yaml": text.encode("ascii")}
+
+
+def map_server_doubt(cells: LayerCells) -> str:
+    """Why these files are left out, or are of no use; nothing if they are there and show something."""
+    known = cells.known
+    if not known.any():
+        seen = f"{cells.keyframes:,} keyframes up to {cells.columns.reach_m:g} m (`export.layer_depth_m`)"
+        return f"Depth of {seen} shows nothing free or occupied: `map.pgm` is one unknown cell"
+    columns, rows = (int(np.ptp(axis[known])) + 1 for axis in (cells.ix, cells.iy))
+    if columns * rows <= MAX_PIXELS:
+        return ""
+    return (
+        f"The map spans more than {MAX_PIXELS:,} cells; `map.pgm` and `map.yaml` were left out. "
+        "A jump in the poses is the usual reason: look at `map.png`."
+    )
 
 
 def occupancy_image(
@@ -36,7 +51,7 @@ def occupancy_image(
     box has more than `MAX_PIXELS` cells; an empty map is one unknown cell, because map_server refuses pictures without
     pixels.
     """
-    known = ~np.isnan(cells.occupancy)
+    known = cells.known
     ix, iy, occupancy = cells.ix[known], cells.iy[known], cells.occupancy[known]
     if not ix.size:
         return np.full((1, 1), unknown, np.uint8), (0.0, 0.0)

@@ -53,6 +53,11 @@ class LayerCells:
     keyframes: int
     """Whose depth was taken up."""
 
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(n,) of which cells occupancy is known; of the others only a height is."""
+        return ~np.isnan(self.occupancy)
+
     def rows(self) -> dict[str, list[Any]]:
         """Of the layers table."""
         return {

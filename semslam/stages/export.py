@@ -29,7 +29,7 @@ from semslam.geometry import rle
 from semslam.geometry.frames import SE2
 from semslam.geometry.projection import flying, main_body, points_in_robot
 from semslam.slam.depth_sight import DepthImage
-from semslam.slam.exchange import MAX_PIXELS, map_server_files, tum_of
+from semslam.slam.exchange import map_server_doubt, map_server_files, tum_of
 from semslam.slam.layer_picture import layers_subtitle, render_layers
 from semslam.slam.layers import LayerCells, Layers
 from semslam.slam.objects import Patch, things
@@ -184,12 +184,8 @@ def _layers(ctx: StageContext, poses: Mapping[int, SE2], config: ExportConfig) -
 
 def _write_occupancy(shard: ShardWriter, cells: LayerCells, config: ExportConfig) -> None:
     """map.pgm and map.yaml."""
-    files = map_server_files(cells, config.free_threshold, config.occupied_threshold)
-    if files is None:
-        shard.warn(
-            f"The map spans more than {MAX_PIXELS:,} cells; `map.pgm` and `map.yaml` were left out. "
-            "A jump in the poses is the usual reason: look at `map.png`."
-        )
-        return
-    for name, content in files.items():
+    doubt = map_server_doubt(cells)
+    if doubt:
+        shard.warn(doubt)
+    for name, content in map_server_files(cells, config.free_threshold, config.occupied_threshold).items():
         shard.path(name).write_bytes(content)
