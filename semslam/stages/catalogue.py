@@ -45,7 +45,7 @@ EXTRACT = Stage(
 )
 LOCALIZE = Stage(
     "localize",
-    version=5,
+    version=6,
     config=LocalizeConfig,
     reads=(FRAMES, MOTION, OBSERVATIONS),
     writes=(POSES, SNAPSHOTS, CELLS, PLACES),

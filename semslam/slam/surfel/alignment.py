@@ -23,6 +23,10 @@ _SAME_WAY = 0.85
 """Least cosine between two normals of one surface: 32 degrees."""
 _OUTLIER = 2.5
 """Standard deviations at which a distance has a quarter of its weight."""
+_HELD_M = 0.1
+"""Standard deviation along the floor that the surfaces of two keyframes must seem to leave at most."""
+_TINY = 1e-12
+"""Share of a Hessian that keeps parts of it solvable of which it says nothing."""
 _SHARED = 0.2
 """What a distance counts: those of neighbours err alike, since they come from the same pixels and surfaces."""
 
@@ -56,25 +60,25 @@ class Target:
 
     def fit(self, moved: Surfels, reach_m: float) -> Fit:
         """Compare surfels, already moved into this frame, with the nearest ones up to `reach_m` away."""
-        nothing = np.zeros((0, 3))
         if not len(moved) or not len(self.surfels):
-            return Fit(nothing, nothing, np.zeros(0), np.zeros(0))
+            return Fit.nothing()
         if self._farthest_m:
             inside = np.isin(_numbers(_cells(moved.points, self._farthest_m)), self._around)
             moved = Surfels(moved.points[inside], moved.normals[inside], moved.sigma_m[inside])
         if not len(moved):
-            return Fit(nothing, nothing, np.zeros(0), np.zeros(0))
+            return Fit.nothing()
         found, squared = self.tree.batch_nearest_neighbor_search(moved.points)
         near = np.asarray(found, np.int64).ravel()
         cosine = np.einsum("ij,ij->i", moved.normals, self.surfels.normals[near])
         source = np.flatnonzero((np.asarray(squared).ravel() < reach_m**2) & (cosine > _SAME_WAY))
         near = near[source]
         normals = moved.normals[source] + self.surfels.normals[near]
-        normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
+        squared_sum = np.einsum("ij,ij->i", normals, normals)
+        normals /= np.sqrt(squared_sum)[:, None]
         points = moved.points[source]
         distance = np.einsum("ij,ij->i", normals, points - self.surfels.points[near])
         sigma = np.hypot(moved.sigma_m[source], self.surfels.sigma_m[near])
-        return Fit(points, normals, distance, sigma)
+        return Fit(points, normals, distance, sigma, np.maximum(0.0, 4.0 - squared_sum) / 8.0)
 
 
 def _cells(points: Floats, side_m: float) -> NDArray[np.int64]:
@@ -100,6 +104,14 @@ class Fit:
     """(K,) signed."""
     sigma_m: Floats
     """(K,) its standard deviation."""
+    bent: Floats
+    """(K,) variance of the normal's direction (rad^2) about each of two axes across it, as two normals that should be
+    one tell it: a quarter of their squared angle for each of them, half of that for their mean."""
+
+    @staticmethod
+    def nothing() -> Fit:
+        """No surfels."""
+        return Fit(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.distance_m)
@@ -111,12 +123,76 @@ class Fit:
         return _SHARED * (share / self.sigma_m) ** 2
 
     def equations(self, about: Floats) -> tuple[Floats, Floats]:
-        """Hessian (6, 6) and gradient (6,) for a turn (3) of the source about a point (3,) and a shift (3)."""
-        x, y, z = (self.points - about).T
-        a, b, c = self.normals.T
-        jacobian = np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c])  # (6, K)
+        """Hessian (6, 6) and gradient (6,) for a turn (3) of the source about a point (3,) and a shift (3).
+
+        The noise of normals alone seems to hold a pose to some centimetres where it is: good for going a step from a
+        pose that was chosen by other means, but no knowledge.
+        """
+        jacobian = self._jacobian(about)
         weighted = jacobian * self.weights
         return weighted @ jacobian.T, weighted @ self.distance_m
+
+    def knowledge(self, about: Floats) -> tuple[Floats, Floats]:
+        """`equations` without what the noise of normals alone tells: see `_rid_of`."""
+        jacobian, noisy = self._jacobian(about), self.weights * self.bent
+        spurious = _all_ways(self.points - about, noisy) - (jacobian * noisy) @ jacobian.T
+        return _rid_of(spurious, *self.equations(about))
+
+    def shows_walls(self, about: Floats) -> bool:
+        """Whether there is more to compare than a floor, which tells heights alone."""
+        return held(self.equations(about)[0]) > _HELD_M**-2
+
+    def _jacobian(self, about: Floats) -> Floats:
+        """(6, K)"""
+        x, y, z = (self.points - about).T
+        a, b, c = self.normals.T
+        return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c])
+
+
+def held(hessian: Floats) -> float:
+    """Information (1 / m^2) about the place on the floor along which it is known worst, whatever tilt and turn."""
+    return float(_on_floor(hessian)[0][0])
+
+
+def weakest(hessian: Floats) -> Floats:
+    """(2,) unit vector on the floor along which a pose is held worst, whatever its turn."""
+    return _on_floor(hessian)[1][:, 0]
+
+
+def _on_floor(hessian: Floats) -> tuple[Floats, Floats]:
+    """Eigenvalues (2,), rising, and eigenvectors (2, 2) of what a Hessian (6, 6) tells of x and y alone."""
+    keep, rest = [3, 4], [0, 1, 2, 5]
+    others = hessian[np.ix_(rest, rest)] + np.diag(np.full(4, _TINY * (1.0 + np.trace(hessian))))
+    tied = hessian[np.ix_(keep, rest)] @ np.linalg.solve(others, hessian[np.ix_(rest, keep)])
+    values, vectors = np.linalg.eigh(hessian[np.ix_(keep, keep)] - tied)
+    return np.asarray(values), np.asarray(vectors)
+
+
+def _all_ways(points: Floats, weights: Floats) -> Floats:
+    """Hessian (6, 6) that points (K, 3) would have if each of them were held along all three axes."""
+    total, sums = float(weights.sum()), weights @ points
+    squares = (points * weights[:, None]).T @ points
+    x, y, z = sums
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turns = np.trace(squares) * np.eye(3) - squares
+    return np.block([[turns, cross], [cross.T, total * np.eye(3)]])
+
+
+def _rid_of(spurious: Floats, hessian: Floats, gradient: Floats) -> tuple[Floats, Floats]:
+    """Normal equations without what is expected of them where nothing is known.
+
+    Normals scatter about that of a wall, and so each of them says a little of where one is along the wall. Their errors
+    are squared in the Hessian, so that hundreds of them say a lot: a wall alone would hold a robot to centimetres along
+    it. Directions are taken in which Hessian and spurious part have no mixed terms; in each the Hessian and the
+    gradient are lowered alike, so that what it tells stays what it was, but it weighs less, or nothing.
+    """
+    scale = np.sqrt(np.maximum(np.diag(hessian), 1e-12))
+    lower = np.linalg.cholesky(hessian / np.outer(scale, scale) + _TINY * np.eye(6)) * scale[:, None]
+    inverse = np.linalg.inv(lower)
+    shares, ways = np.linalg.eigh(inverse @ spurious @ inverse.T)
+    kept = np.maximum(0.0, 1.0 - shares)
+    forth = lower @ ways
+    return (forth * kept) @ forth.T, (forth * kept) @ (ways.T @ (inverse @ gradient))
 
 
 def pair_equations(

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from semslam.geometry.frames import Matrix, invert
 from semslam.slam.surfel.alignment import between, change_between
 from semslam.slam.surfel.places import Keyframe, Place
-from semslam.slam.surfel.search import HELD_M, held
 from semslam.slam.surfel.sight import agreement
 
 Floats = NDArray[np.float64]
@@ -105,5 +104,5 @@ def _laid(source: Keyframe, target: Keyframe, target_from_source: Matrix, reach_
     fit = target.target.fit(source.surfels.moved(target_from_source), reach_m)
     if len(fit) < _MIN_MATCHES:
         return None
-    hessian, gradient = fit.equations(target_from_source[:3, 3])
-    return Laid(target_from_source, hessian, gradient, held(hessian) > HELD_M**-2)
+    about = target_from_source[:3, 3]
+    return Laid(target_from_source, *fit.knowledge(about), fit.shows_walls(about))

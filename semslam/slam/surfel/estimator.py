@@ -248,12 +248,17 @@ def _carried(other_from_own: SE2, error: Floats, own: SE2, own_error: Floats) ->
     return np.asarray(arm @ error @ arm.T + along(own_error, there))
 
 
+def _values(pose: SE2 | None) -> NDArray[np.float64]:
+    """(3,), or empty for none."""
+    return np.array([] if pose is None else [pose.x_m, pose.y_m, pose.heading_rad])
+
+
 def _packed(place: Place, seen: Seen) -> bytes:
-    motion = place.motion
     arrays: _Arrays = {
         "pose": place.pose,
         "seconds": np.array(place.seconds),
-        "motion": np.array([] if motion is None else [motion.x_m, motion.y_m, motion.heading_rad]),
+        "motion": _values(place.motion),
+        "step": _values(place.step),
         "linked": np.array([place.linked, place.group]),
         "cells": seen.cells,
         "weights": seen.weights,
@@ -274,10 +279,11 @@ def _unpacked(packed: bytes) -> tuple[Place, Seen]:
     if "points" in arrays:
         surfels = Surfels(*(arrays[name].astype(np.float64) for name in ("points", "normals", "sigma_m")))
         keyframe = Keyframe(surfels, Sight.from_arrays(arrays))
-    motion = SE2(*arrays["motion"].tolist()) if arrays["motion"].size else None
+    motion, step = (SE2(*arrays[name].tolist()) if arrays[name].size else None for name in ("motion", "step"))
     linked, group = arrays["linked"].tolist()
     seconds = arrays["seconds"].item()
     place = placed(keyframe, arrays["pose"], seconds, motion, linked=bool(linked), group=group)
+    place = replace(place, step=step)
     if "anchor" in arrays:
         tied = Anchor(int(arrays["anchor"]), arrays["anchor_from_robot"], arrays["hessian"])
         place = replace(place, anchor=tied)

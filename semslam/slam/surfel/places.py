@@ -88,6 +88,8 @@ class Place:
     itself by few pictures."""
     anchor: Anchor | None = None
     """Of one whose pictures were left out since they showed nothing new."""
+    step: SE2 | None = None
+    """From the keyframe before, as pictures and motion told it on the walk; None where one of the two was not found."""
 
     @property
     def pictured(self) -> bool:
@@ -108,7 +110,7 @@ def placed(
 def moved(place: Place, pose: Matrix) -> Place:
     """The same keyframe somewhere else."""
     there = placed(place.keyframe, pose, place.seconds, place.motion, linked=place.linked, group=place.group)
-    return replace(there, anchor=place.anchor)
+    return replace(there, anchor=place.anchor, step=place.step)
 
 
 @dataclass(frozen=True, eq=False)

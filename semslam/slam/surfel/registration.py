@@ -137,6 +137,7 @@ def _proposal(asked: Sequence[Place], known: Sequence[Place], target: Target, gu
         weight = np.diag([level, level, 1e-6, 1e-6, 1e-6, height])
         shift = nudged(shift, np.asarray(-np.linalg.solve(hessian + weight, gradient + weight @ unlevel(shift))))
     seen, samples, alike = _compared(asked, known, shift)
+    hessian, _ = fit.knowledge(shift[:3, 3])
     keep = np.ix_([3, 4, 2], [3, 4, 2])
     covariance = np.asarray(DOUBT * np.linalg.inv(hessian + weight)[keep], np.float64)
     return Proposal(planar(shift), guess.score, _likeness(seen), seen.told / max(1, samples), covariance, alike)

@@ -24,20 +24,34 @@ def rejoined(smoothed: Smoothed, seen: Sequence[Seen], grid: Grid) -> list[Place
 
     `seen`: the observation of each.
     """
-    main, *others = smoothed.parts
+    main = smoothed.parts[0]
     places, whole = list(smoothed.places), list(main)
     there: Submap | None = None  # that of `whole`
-    for part in sorted(others, key=len, reverse=True):
-        if len(part) < _LEAST:
-            break
+    for part in _large(smoothed):
         there = there or _map(places, seen, grid, whole)
         found = place_in(_map(places, seen, grid, part), there).other_from_own
         if found is not None:
-            for index in part:
+            for index in _with_followers(part, smoothed):
                 place = moved(places[index], found.matrix @ places[index].pose)
                 places[index] = replace(place, group=places[main[0]].group)
             whole, there = whole + part, None
     return places if len(whole) > len(main) else None
+
+
+def _with_followers(part: Sequence[int], smoothed: Smoothed) -> list[int]:
+    """A part, and after each of its keyframes those of no part worth looking for, to which motion leads from there:
+    what shows nothing that others do goes where its neighbours in time go."""
+    looked_for = {index for one in (smoothed.parts[0], *_large(smoothed)) for index in one}
+    found = set(part)
+    for index in range(min(part) + 1, len(smoothed.places)):
+        if index - 1 in found and index not in looked_for and smoothed.places[index].motion is not None:
+            found.add(index)
+    return sorted(found)
+
+
+def _large(smoothed: Smoothed) -> list[list[int]]:
+    """Parts that are looked for, the largest first."""
+    return sorted((part for part in smoothed.parts[1:] if len(part) >= _LEAST), key=len, reverse=True)
 
 
 def without_specks(places: Sequence[Place]) -> list[Place]:
@@ -51,7 +65,7 @@ def without_specks(places: Sequence[Place]) -> list[Place]:
         else:
             before = kept[-1]
             there = moved(place, before.pose @ place.motion.matrix) if place.motion else place
-            kept.append(replace(there, group=before.group, linked=False, anchor=None))
+            kept.append(replace(there, group=before.group, linked=False, anchor=None, step=None))
     return kept
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semslam.geometry.frames import SE2, Matrix
-from semslam.slam.surfel.alignment import Fit, Target, between, change_between, nudged
+from semslam.slam.surfel.alignment import Fit, Target, between, change_between, nudged, weakest
 from semslam.slam.surfel.places import Keyframe
 from semslam.slam.surfel.sight import Agreement, agreement
 from semslam.slam.surfel.surfels import Surfels
@@ -23,8 +23,6 @@ from semslam.stages.settings import SurfelConfig
 
 Floats = NDArray[np.float64]
 
-HELD_M = 0.1
-"""Standard deviation along the floor up to which surfaces hold one keyframe to another: a floor alone tells heights."""
 _FIRST_REACH_M, _REACH_M, _SHRINK = 0.3, 0.1, 0.7
 _ROUNDS, _COARSE_ROUNDS = 12, 5
 _STILL = 1e-4
@@ -53,8 +51,6 @@ so from elsewhere."""
 _TOO_FEW = 0.04
 """Share of samples that must be found again, or the pictures have nothing in common."""
 _MIN_MATCHES = 40
-_TINY = 1e-12
-"""Share of a Hessian that keeps parts of it solvable of which it says nothing."""
 _CLEARLY = 0.3
 """Standard deviations by which the mean difference of one pose is smaller than that of another that is worse."""
 _WIDE_M, _WIDE_RAD = 0.2, 0.35
@@ -68,6 +64,8 @@ class Found:
     pose: Matrix
     hessian: Floats
     """(6, 6) of the surfaces alone."""
+    walls: bool
+    """Whether the surfaces are more than a floor."""
     sure: bool
     """Whether pictures alone would do to tell."""
     seen: Agreement
@@ -116,7 +114,9 @@ class Search:
         seen = self._agreement(pose)
         if len(fit) < _MIN_MATCHES or self._too_few(seen) or not seen.same_place(self._samples, sure=self._wide):
             return None
-        return Found(pose, fit.equations(pose[:3, 3])[0], seen.same_place(self._samples, sure=True), seen)
+        about = pose[:3, 3]
+        sure = seen.same_place(self._samples, sure=True)
+        return Found(pose, fit.knowledge(about)[0], fit.shows_walls(about), sure, seen)
 
     def _starts(self) -> list[Matrix]:
         """Headings that agree best, none beside another; and, since only what is nearly right already agrees well, some
@@ -149,7 +149,7 @@ class Search:
         cost = self._cost(pose)
         for _ in range(_TIMES_BESIDE):
             hessian, _ = self._fit(pose, _REACH_M, coarse=True).equations(pose[:3, 3])
-            direction = _weakest(hessian + self._level)
+            direction = weakest(hessian + self._level)
             places = [nudged(pose, np.array([0.0, 0.0, 0.0, *(away * direction), 0.0])) for away in _BESIDE_M]
             best = min(places, key=self._cost)
             if self._cost(best) >= cost:
@@ -202,22 +202,3 @@ class Search:
 def unlevel(pose: Matrix) -> Floats:
     """(6,) tilt of a pose as a turn from the upright, and its height above the floor."""
     return np.array([-pose[1, 2], pose[0, 2], 0.0, 0.0, 0.0, pose[2, 3]])
-
-
-def held(hessian: Floats) -> float:
-    """Information (1 / m^2) about the place on the floor along which it is known worst, whatever tilt and turn."""
-    return float(_on_floor(hessian)[0][0])
-
-
-def _weakest(hessian: Floats) -> Floats:
-    """(2,) unit vector on the floor along which a pose is held worst, whatever its turn."""
-    return _on_floor(hessian)[1][:, 0]
-
-
-def _on_floor(hessian: Floats) -> tuple[Floats, Floats]:
-    """Eigenvalues (2,), rising, and eigenvectors (2, 2) of what a Hessian (6, 6) tells of x and y alone."""
-    keep, rest = [3, 4], [0, 1, 2, 5]
-    others = hessian[np.ix_(rest, rest)] + np.diag(np.full(4, _TINY * (1.0 + np.trace(hessian))))
-    tied = hessian[np.ix_(keep, rest)] @ np.linalg.solve(others, hessian[np.ix_(rest, keep)])
-    values, vectors = np.linalg.eigh(hessian[np.ix_(keep, keep)] - tied)
-    return np.asarray(values), np.asarray(vectors)

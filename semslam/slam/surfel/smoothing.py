@@ -35,6 +35,8 @@ _LEAST_SHARED = 0.15
 """Share of the smaller one's voxels that two keyframes must have in common."""
 _MOST_SIGMAS = 5.0
 """Motion that is farther off than this has less than half of its weight (Cauchy): slipping wheels, a parked robot."""
+_STEP_M, _STEP_RAD = 0.05, 0.05
+"""Standard deviations of a step as it was found on the walk, along each axis and of the turn."""
 _STILL = 1e-3
 """Metres and radians of a change that is no improvement any more."""
 DOUBT = 3.0
@@ -144,6 +146,7 @@ def _equations(
         _level(equations, places, index, config)
         if index:
             _move(equations, before, index, config)
+            _step(equations, places, index)
         _anchor(equations, places, index)
     known = before.scale * bias_sigmas(config) ** 2
     equations.add((equations.bias,), np.diag(1.0 / known), before.bias / known)
@@ -196,7 +199,8 @@ def _tie(equations: _Equations, places: Sequence[Place], pair: tuple[int, int], 
     for laid, (source, target) in ((comparison.there, pair), (comparison.back, pair[::-1])):
         if laid:
             pose = places[target].pose
-            equations.add((source, target), *pair_equations(laid.hessian, laid.gradient, laid.target_from_source, pose))
+            known = laid.hessian / DOUBT, laid.gradient / DOUBT
+            equations.add((source, target), *pair_equations(*known, laid.target_from_source, pose))
     return comparison.ties
 
 
@@ -231,6 +235,19 @@ def _move(equations: _Equations, known: Smoothed, index: int, config: SurfelConf
     equations.add((index - 1, index, equations.bias), weighted @ jacobian, weighted @ error)
 
 
+def _step(equations: _Equations, places: Sequence[Place], index: int) -> None:
+    """The search on the walk chose between places where surfaces lie equally well by the edges in the pictures, which
+    surfaces know nothing of: it counts a little, where nothing else does."""
+    step = places[index].step
+    if step is None:
+        return
+    error, jacobian = _off(places[index - 1].pose, places[index].pose, step.matrix)
+    known = np.array([_STEP_RAD, _STEP_M, _STEP_M]) ** -2.0
+    doubt = 1.0 + float((error[2:5] ** 2 * known).sum()) / _MOST_SIGMAS**2
+    weighted = jacobian.T * np.array([0.0, 0.0, *(known / doubt), 0.0])
+    equations.add((index - 1, index), weighted @ jacobian, weighted @ error)
+
+
 def _anchor(equations: _Equations, places: Sequence[Place], index: int) -> None:
     """A keyframe whose pictures were not kept stays where it was found beside its anchor."""
     anchor, pose = places[index].anchor, places[index].pose
@@ -239,7 +256,7 @@ def _anchor(equations: _Equations, places: Sequence[Place], index: int) -> None:
     known = places[anchor.index].pose
     error, jacobian = _off(known, pose, anchor.anchor_from_robot)
     turn = np.kron(np.eye(2), known[:3, :3])
-    weighted = jacobian.T @ turn @ anchor.hessian @ turn.T
+    weighted = jacobian.T @ turn @ (anchor.hessian / DOUBT) @ turn.T
     equations.add((anchor.index, index), weighted @ jacobian, weighted @ error)
 
 
@@ -293,7 +310,7 @@ class _Equations:
         keep, step = np.ix_([3, 4, 2], [3, 4, 2]), math.ceil(self.bias / _MOST_MARGINALS)
         exact = sorted({*range(0, self.bias, step), self.bias - 1})
         try:
-            known = {key: DOUBT * np.asarray(marginals.marginalCovariance(key))[keep] for key in exact}
+            known = {key: np.asarray(marginals.marginalCovariance(key))[keep] for key in exact}
         except RuntimeError:
             return []
         beside = [(exact[bisect_right(exact, key) - 1], exact[bisect_left(exact, key)]) for key in range(self.bias)]

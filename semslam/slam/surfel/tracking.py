@@ -15,7 +15,7 @@ from semslam.slam.surfel.alignment import between, rotation_vector
 from semslam.slam.surfel.coverage import Coverage
 from semslam.slam.surfel.motion_prior import PAUSE_S, Expected, MotionPrior
 from semslam.slam.surfel.places import Anchor, Keyframe, Place, placed, shared_voxels
-from semslam.slam.surfel.search import HELD_M, Found, Search, held
+from semslam.slam.surfel.search import Found, Search
 from semslam.slam.surfel.sight import agreement
 from semslam.slam.surfel.uncertainty import along, grown
 from semslam.stages.settings import SurfelConfig
@@ -81,19 +81,21 @@ class Track:
         found = self._found(keyframe, starts, opened)
         if found is None:
             return self._go_on(keyframe, start, seconds, motion, expected, opened)
-        if held(found.hessian) < HELD_M**-2:  # along a corridor motion tells the way; across it the walls do
+        if not found.walls:  # along a corridor motion tells the way; across it the walls do
             self.open = opened
             return self._remember(keyframe, found.pose, seconds, motion, linked=False)
         if keyframe and (self.parked or _lost(opened)) and not self._seen_together(keyframe, found.pose):
             self.group += 1
         self.open, self.parked = np.zeros((3, 3)), False
         pose, hessian = found.pose, found.hessian
+        seen = None
         if before.linked:
             seen = planar(between(before.pose, pose))
             self.prior.see(seen, seconds)
             if motion is not None and seconds <= PAUSE_S:
                 self.prior.learn(motion, seconds, seen, _covariance_in_robot(hessian, before.pose))
         place = placed(keyframe, pose, seconds, motion, linked=True, group=self.group)
+        place = replace(place, step=seen if before.group == self.group else None)
         if keyframe and found.sure and (self._shown(keyframe, pose) or self._just_kept(pose, seconds)):
             place = self._left_out(place, hessian)
         self.recall(place)
@@ -127,7 +129,7 @@ class Track:
         turn = np.kron(np.eye(2), known[:3, :3])
         anchor = Anchor(nearest, between(known, place.pose), turn.T @ hessian @ turn)
         alone = placed(None, place.pose, place.seconds, place.motion, linked=True, group=place.group)
-        return replace(alone, anchor=anchor)
+        return replace(alone, anchor=anchor, step=place.step)
 
     def _go_on(
         self,
