@@ -40,9 +40,8 @@ _STEP_M, _STEP_RAD = 0.05, 0.05
 _STILL = 1e-3
 """Metres and radians of a change that is no improvement any more."""
 DOUBT = 3.0
-"""By how much covariances are larger than the equations say, since neighbouring surfels err alike, and the same ones in
-many pairs: of 10 simulated drives, 80 keyframes each, the squared Mahalanobis distance of the truth is then 0.8 of what
-it should be on average."""
+"""By how much less surfaces tell than their equations say, since neighbouring surfels err alike, and the same ones in
+many pairs: the squared Mahalanobis distance of the truth is then what it should be (benchmarks/calibration.py)."""
 _MOST_MARGINALS = 500
 """Poses whose covariance is worked out exactly: each takes longer, the more there are."""
 _FIXED = 1e8
