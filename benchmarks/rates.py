@@ -13,20 +13,13 @@ import argparse
 import json
 import subprocess
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from machine import machine
-
-from semslam.bench.peers import track
-from semslam.bench.tracks import column_track
-from semslam.metrics import Score, Track, score
-from semslam.pipeline.run_tables import run_tables
-from semslam.tables.parquet import TableFiles
-from semslam.tables.spec import FRAMES, MOTION, TRUTH
+from peers import peer_scores
 
 RATES_HZ = (10.0, 2.0, 1.0, 0.5, 0.2)
 ESTIMATORS = ("surfel", "paper", "paper_visual", "orb_rgbd", "mapnet", "deepvo", "dead_reckoning")
@@ -85,22 +78,8 @@ def at_rate(rate: float, logs: Sequence[Path], out: Path, estimators: Sequence[s
     for line in json.loads(told.stdout)["scores"]:
         scores.setdefault(line["estimator"], []).append(line)
     if peer:
-        scores[PEER] = [vars(one) for one in peer_scores(folder)]
+        scores[PEER] = [vars(one) for _, one in peer_scores(folder, PEER)]
     return {name: mean(lines) for name, lines in scores.items()}
-
-
-def peer_scores(run: Path) -> list[Score]:
-    """small_gicp on motion, on the keyframes that the estimators had."""
-    found = []
-    columns = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")
-    for tables in run_tables(run, (FRAMES, MOTION, TRUTH)).values():
-        frames, motion, told = (tables[table.name] for table in (FRAMES, MOTION, TRUTH))
-        rows = TableFiles(TRUTH, told).read(columns)
-        truth = Track.of(*(rows[name] for name in columns))
-        arguments = {"peer": PEER, "frames": frames, "motion": motion, "steps": len(rows["frame"])}
-        with tempfile.TemporaryDirectory() as temporary:
-            found.append(score(truth, column_track(track(arguments, Path(temporary)), truth)))
-    return found
 
 
 def mean(lines: Sequence[Mapping[str, Any]]) -> Point:
