@@ -52,7 +52,7 @@ def test_a_wall_tells_nothing_of_the_way_along_it(tilt_deg: float) -> None:
     """Scattered normals seem to hold a robot to centimetres there; five sixths of that, or more, are told to be noise.
     Across the wall nothing is lost."""
     fit = of_wall(math.radians(tilt_deg))
-    seeming, known = (sigmas(told(np.zeros(3))[0]) for told in (fit.equations, fit.knowledge))
+    seeming, known = (sigmas(told(np.zeros(3))[0]) for told in (fit.equations, fit.information))
     assert seeming[1] < 0.08
     assert known[1] > 2.4 * seeming[1]
     assert known[0] == pytest.approx(seeming[0], rel=0.02)
@@ -64,7 +64,7 @@ def test_what_surfaces_do_tell_stays() -> None:
     one, other = (Keyframe.of(room.view(matrix(SE2(x, 0.0, 0.0))), CONFIG) for x in (0.0, 0.3))
     pose = matrix(SE2(0.31, -0.01, 0.01))
     fit = Target(one.surfels).fit(other.surfels.moved(pose), 0.1)
-    (seeming, pull), (known, less) = fit.equations(pose[:3, 3]), fit.knowledge(pose[:3, 3])
+    (seeming, pull), (known, less) = fit.equations(pose[:3, 3]), fit.information(pose[:3, 3])
     np.testing.assert_allclose(np.linalg.solve(known, less), np.linalg.solve(seeming, pull), atol=1e-6)
     before, after = (np.linalg.inv(hessian)[[2, 3, 4], [2, 3, 4]] for hessian in (seeming, known))
     assert (after >= before * (1 - 1e-9)).all()

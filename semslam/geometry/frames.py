@@ -193,11 +193,11 @@ def rotation_from_vector(rotation_vector: ArrayLike) -> NDArray[np.float64]:
     angle = np.linalg.norm(vector, axis=-1)[..., None, None]
     first = np.sinc(angle / math.pi)  # sin(a) / a
     second = 0.5 * np.sinc(angle / math.tau) ** 2  # (1 - cos(a)) / a^2
-    cross = _cross_matrix(vector)
+    cross = cross_matrix(vector)
     return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
 
 
-def _cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     """(..., 3, 3) matrices whose product with w is vector x w."""
     cross = np.zeros((*vector.shape[:-1], 3, 3))
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]

@@ -7,6 +7,7 @@ standard deviation that the two together have. Distances far beyond it lose thei
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.geometry.frames import Matrix, invert, rotation_from_vector
+from semslam.geometry.frames import Matrix, cross_matrix, invert, rotation_from_vector
 from semslam.slam.surfel.surfels import Surfels
 
 Floats = NDArray[np.float64]
@@ -23,10 +24,13 @@ _SAME_WAY = 0.85
 """Least cosine between two normals of one surface: 32 degrees."""
 _OUTLIER = 2.5
 """Standard deviations at which a distance has a quarter of its weight."""
+DOUBT = 3.0
+"""By how much less surfaces tell than their equations say, since neighbouring surfels err alike, and the same ones in
+many pairs: the squared Mahalanobis distance of the truth is then what it should be (benchmarks/calibration.py)."""
 _HELD_M = 0.1
-"""Standard deviation along the floor that the surfaces of two keyframes must seem to leave at most."""
-_TINY = 1e-12
-"""Share of a Hessian that keeps parts of it solvable of which it says nothing."""
+"""Standard deviation along one direction of the floor that surfaces must leave at most to be a wall."""
+_TINY, _LEAST = 1e-12, 1e-12
+"""Share of a Hessian that keeps parts of it solvable of which it says nothing; the least that it is taken to be."""
 _SHARED = 0.2
 """What a distance counts: those of neighbours err alike, since they come from the same pixels and surfaces."""
 
@@ -104,7 +108,7 @@ class Fit:
     """(K,) signed."""
     sigma_m: Floats
     """(K,) its standard deviation."""
-    bent: Floats
+    normal_variance: Floats
     """(K,) variance of the normal's direction (rad^2) about each of two axes across it, as two normals that should be
     one tell it: a quarter of their squared angle for each of them, half of that for their mean."""
 
@@ -132,15 +136,12 @@ class Fit:
         weighted = jacobian * self.weights
         return weighted @ jacobian.T, weighted @ self.distance_m
 
-    def knowledge(self, about: Floats) -> tuple[Floats, Floats]:
-        """`equations` without what the noise of normals alone tells: see `_rid_of`."""
-        jacobian, noisy = self._jacobian(about), self.weights * self.bent
-        spurious = _all_ways(self.points - about, noisy) - (jacobian * noisy) @ jacobian.T
-        return _rid_of(spurious, *self.equations(about))
-
-    def shows_walls(self, about: Floats) -> bool:
-        """Whether there is more to compare than a floor, which tells heights alone."""
-        return held(self.equations(about)[0]) > _HELD_M**-2
+    def information(self, about: Floats) -> tuple[Floats, Floats]:
+        """`equations` without what the noise of normals alone tells (`_without_spurious`), over `DOUBT`."""
+        jacobian, noisy = self._jacobian(about), self.weights * self.normal_variance
+        spurious = _point_hessian(self.points - about, noisy) - (jacobian * noisy) @ jacobian.T
+        hessian, gradient = _without_spurious(spurious, *self.equations(about))
+        return hessian / DOUBT, gradient / DOUBT
 
     def _jacobian(self, about: Floats) -> Floats:
         """(6, K)"""
@@ -149,36 +150,15 @@ class Fit:
         return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c])
 
 
-def held(hessian: Floats) -> float:
-    """Information (1 / m^2) about the place on the floor along which it is known worst, whatever tilt and turn."""
-    return float(_on_floor(hessian)[0][0])
-
-
-def weakest(hessian: Floats) -> Floats:
-    """(2,) unit vector on the floor along which a pose is held worst, whatever its turn."""
-    return _on_floor(hessian)[1][:, 0]
-
-
-def _on_floor(hessian: Floats) -> tuple[Floats, Floats]:
-    """Eigenvalues (2,), rising, and eigenvectors (2, 2) of what a Hessian (6, 6) tells of x and y alone."""
-    keep, rest = [3, 4], [0, 1, 2, 5]
-    others = hessian[np.ix_(rest, rest)] + np.diag(np.full(4, _TINY * (1.0 + np.trace(hessian))))
-    tied = hessian[np.ix_(keep, rest)] @ np.linalg.solve(others, hessian[np.ix_(rest, keep)])
-    values, vectors = np.linalg.eigh(hessian[np.ix_(keep, keep)] - tied)
-    return np.asarray(values), np.asarray(vectors)
-
-
-def _all_ways(points: Floats, weights: Floats) -> Floats:
+def _point_hessian(points: Floats, weights: Floats) -> Floats:
     """Hessian (6, 6) that points (K, 3) would have if each of them were held along all three axes."""
-    total, sums = float(weights.sum()), weights @ points
     squares = (points * weights[:, None]).T @ points
-    x, y, z = sums
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cross = cross_matrix(weights @ points)
     turns = np.trace(squares) * np.eye(3) - squares
-    return np.block([[turns, cross], [cross.T, total * np.eye(3)]])
+    return np.block([[turns, cross], [cross.T, float(weights.sum()) * np.eye(3)]])
 
 
-def _rid_of(spurious: Floats, hessian: Floats, gradient: Floats) -> tuple[Floats, Floats]:
+def _without_spurious(spurious: Floats, hessian: Floats, gradient: Floats) -> tuple[Floats, Floats]:
     """Normal equations without what is expected of them where nothing is known.
 
     Normals scatter about that of a wall, and so each of them says a little of where one is along the wall. Their errors
@@ -186,13 +166,37 @@ def _rid_of(spurious: Floats, hessian: Floats, gradient: Floats) -> tuple[Floats
     it. Directions are taken in which Hessian and spurious part have no mixed terms; in each the Hessian and the
     gradient are lowered alike, so that what it tells stays what it was, but it weighs less, or nothing.
     """
-    scale = np.sqrt(np.maximum(np.diag(hessian), 1e-12))
+    scale = np.sqrt(np.maximum(np.diag(hessian), _LEAST))
     lower = np.linalg.cholesky(hessian / np.outer(scale, scale) + _TINY * np.eye(6)) * scale[:, None]
     inverse = np.linalg.inv(lower)
     shares, ways = np.linalg.eigh(inverse @ spurious @ inverse.T)
     kept = np.maximum(0.0, 1.0 - shares)
     forth = lower @ ways
     return (forth * kept) @ forth.T, (forth * kept) @ (ways.T @ (inverse @ gradient))
+
+
+def shows_wall(information: Floats) -> bool:
+    """Whether surfaces hold a pose along one direction of the floor at least: a floor alone tells heights."""
+    return float(_on_floor(information)[0][1]) > _HELD_M**-2
+
+
+def weakest_direction(hessian: Floats) -> Floats:
+    """(2,) unit vector on the floor along which a pose is held worst, whatever its turn."""
+    return _on_floor(hessian)[1][:, 0]
+
+
+def _on_floor(hessian: Floats) -> tuple[Floats, Floats]:
+    """Eigenvalues (2,), rising, and eigenvectors (2, 2) of what a Hessian (6, 6) tells of x and y alone."""
+    values, vectors = np.linalg.eigh(told_of(hessian, (3, 4)))
+    return np.asarray(values), np.asarray(vectors)
+
+
+def told_of(hessian: Floats, keep: Sequence[int]) -> Floats:
+    """Information about some of the six unknowns, whatever the others are (Schur complement)."""
+    kept, rest = list(keep), [index for index in range(6) if index not in keep]
+    others = hessian[np.ix_(rest, rest)] + np.diag(np.full(len(rest), _TINY * (1.0 + np.trace(hessian))))
+    tied = hessian[np.ix_(kept, rest)] @ np.linalg.solve(others, hessian[np.ix_(rest, kept)])
+    return np.asarray(hessian[np.ix_(kept, kept)] - tied)
 
 
 def pair_equations(
@@ -203,11 +207,10 @@ def pair_equations(
 
     A turn of the target about its own origin moves the source's along with it: J_target = -J_source A.
     """
-    x, y, z = target_from_source[:3, 3]
     whole = np.zeros((6, 12))
     whole[:, :6] = np.eye(6)
     whole[:, 6:] = -np.eye(6)
-    whole[3:, 6:9] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    whole[3:, 6:9] = cross_matrix(target_from_source[:3, 3])
     whole = whole @ np.kron(np.eye(4), parent_from_target[:3, :3].T)
     return whole.T @ hessian @ whole, whole.T @ gradient
 

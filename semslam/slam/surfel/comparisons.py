@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semslam.geometry.frames import Matrix, invert
-from semslam.slam.surfel.alignment import between, change_between
+from semslam.slam.surfel.alignment import between, change_between, shows_wall
 from semslam.slam.surfel.places import Keyframe, Place
 from semslam.slam.surfel.sight import agreement
 
@@ -34,7 +34,7 @@ class Laid:
     gradient: Floats
     """(6,)"""
     ties: bool
-    """Whether they may not slide: a floor alone tells heights, not places."""
+    """Whether there is a wall: a floor alone tells heights, not places."""
 
     def now(self, target_from_source: Matrix) -> Laid:
         """After a small change of the two poses."""
@@ -104,5 +104,5 @@ def _laid(source: Keyframe, target: Keyframe, target_from_source: Matrix, reach_
     fit = target.target.fit(source.surfels.moved(target_from_source), reach_m)
     if len(fit) < _MIN_MATCHES:
         return None
-    about = target_from_source[:3, 3]
-    return Laid(target_from_source, *fit.knowledge(about), fit.shows_walls(about))
+    hessian, gradient = fit.information(target_from_source[:3, 3])
+    return Laid(target_from_source, hessian, gradient, shows_wall(hessian))

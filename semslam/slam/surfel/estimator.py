@@ -19,7 +19,7 @@ from semslam.geometry.frames import SE2, planar
 from semslam.slam.checkpoint import as_array, pack, unpack
 from semslam.slam.estimator import INERTIAL, NONE, START, VISUAL, Mode, PoseEstimate, Step
 from semslam.slam.surfel.motion_prior import MotionPrior, noise_sigmas
-from semslam.slam.surfel.places import Anchor, Keyframe, Place, moved, placed
+from semslam.slam.surfel.places import Anchor, Edges, Keyframe, Place, moved, placed
 from semslam.slam.surfel.prior import Grid, Seen, place_row, read_prior, submap_of
 from semslam.slam.surfel.registration import AMBIGUOUS, Placement, place_in
 from semslam.slam.surfel.rejoining import rejoined, without_specks
@@ -182,7 +182,7 @@ class SurfelEstimator:
             arrays = unpack(part)
             prior = self._track.prior
             prior.bias, prior.covariance, prior.speed = arrays["bias"], arrays["covariance"], arrays["speed"]
-            prior.surprise, prior.steps = float(arrays["surprise"][0]), int(arrays["surprise"][1])
+            prior.surprise, prior.steps = float(arrays["surprise"][0]), float(arrays["surprise"][1])
             self._track.open = arrays["open"]
             self._track.group, self._track.parked = int(arrays["group"][0]), bool(arrays["group"][1])
             for frame, stamp in zip(arrays["frames"].tolist(), arrays["stamps"].tolist(), strict=True):
@@ -253,12 +253,17 @@ def _values(pose: SE2 | None) -> NDArray[np.float64]:
     return np.array([] if pose is None else [pose.x_m, pose.y_m, pose.heading_rad])
 
 
+def _told_by_edges(edges: Edges | None) -> NDArray[np.float64]:
+    """(7,), or empty for none."""
+    return np.array([]) if edges is None else np.append(_values(edges.before_from_robot), edges.information)
+
+
 def _packed(place: Place, seen: Seen) -> bytes:
     arrays: _Arrays = {
         "pose": place.pose,
         "seconds": np.array(place.seconds),
         "motion": _values(place.motion),
-        "step": _values(place.step),
+        "edges": _told_by_edges(place.edges),
         "linked": np.array([place.linked, place.group]),
         "cells": seen.cells,
         "weights": seen.weights,
@@ -279,11 +284,13 @@ def _unpacked(packed: bytes) -> tuple[Place, Seen]:
     if "points" in arrays:
         surfels = Surfels(*(arrays[name].astype(np.float64) for name in ("points", "normals", "sigma_m")))
         keyframe = Keyframe(surfels, Sight.from_arrays(arrays))
-    motion, step = (SE2(*arrays[name].tolist()) if arrays[name].size else None for name in ("motion", "step"))
+    motion = SE2(*arrays["motion"].tolist()) if arrays["motion"].size else None
     linked, group = arrays["linked"].tolist()
     seconds = arrays["seconds"].item()
     place = placed(keyframe, arrays["pose"], seconds, motion, linked=bool(linked), group=group)
-    place = replace(place, step=step)
+    if arrays["edges"].size:
+        values = arrays["edges"].tolist()
+        place = replace(place, edges=Edges(SE2(*values[:3]), np.array(values[3:]).reshape(2, 2)))
     if "anchor" in arrays:
         tied = Anchor(int(arrays["anchor"]), arrays["anchor_from_robot"], arrays["hessian"])
         place = replace(place, anchor=tied)

@@ -53,8 +53,8 @@ class MotionPrior:
     """(3,) m/s, m/s and rad/s of the last step that was seen; a robot that tells no motion is thought to go on so."""
     surprise: float = 0.0
     """Sum of squared Mahalanobis distances of measured motion, each over its degrees of freedom, ..."""
-    steps: int = 0
-    """... and of how many steps."""
+    steps: float = 0.0
+    """... and of how many steps; one that was seen in part counts in part."""
 
     @property
     def scale(self) -> float:
@@ -89,7 +89,8 @@ class MotionPrior:
         squared = float(surprise @ np.linalg.solve(spread, surprise))
         if seconds <= 0:
             return
-        self.surprise, self.steps = self.surprise + min(squared / 3.0, _MOST_SURPRISE), self.steps + 1
+        self.surprise += min(squared / 3.0, _MOST_SURPRISE)
+        self.steps += float(np.mean(1.0 - np.diag(covariance) / np.diag(spread)))
         if squared > _GATE * self.scale:
             return
         gain = seconds * self.covariance @ np.linalg.inv(spread)

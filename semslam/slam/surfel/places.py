@@ -66,6 +66,15 @@ class Anchor:
     along the axes of the anchor."""
 
 
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Where the search of the walk found a keyframe from the one before, and how surely by more than surfaces."""
+
+    before_from_robot: SE2
+    information: Floats
+    """(2, 2) about x and y, along the axes of the keyframe before."""
+
+
 @dataclass(eq=False)
 class Place:
     """A keyframe and where it was taken; without pictures there is only the place."""
@@ -88,8 +97,9 @@ class Place:
     itself by few pictures."""
     anchor: Anchor | None = None
     """Of one whose pictures were left out since they showed nothing new."""
-    step: SE2 | None = None
-    """From the keyframe before, as pictures and motion told it on the walk; None where one of the two was not found."""
+    edges: Edges | None = None
+    """What edges tell of the way from the keyframe before; None where one of the two was not found on the walk, or in
+    another group, and in a log that is merged, whose track has it in it."""
 
     @property
     def pictured(self) -> bool:
@@ -110,7 +120,7 @@ def placed(
 def moved(place: Place, pose: Matrix) -> Place:
     """The same keyframe somewhere else."""
     there = placed(place.keyframe, pose, place.seconds, place.motion, linked=place.linked, group=place.group)
-    return replace(there, anchor=place.anchor, step=place.step)
+    return replace(there, anchor=place.anchor, edges=place.edges)
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,6 @@ from semslam.slam.surfel.places import Keyframe, Place, moved, shared_voxels
 from semslam.slam.surfel.search import unlevel
 from semslam.slam.surfel.semantic_field import Candidate, ClassMap, candidates
 from semslam.slam.surfel.sight import Agreement, agreement
-from semslam.slam.surfel.smoothing import DOUBT
 from semslam.slam.surfel.surfels import Surfels
 
 Floats = NDArray[np.float64]
@@ -127,19 +126,21 @@ def place_in(own: Submap, other: Submap) -> Placement:
 def _proposal(asked: Sequence[Place], known: Sequence[Place], target: Target, guess: Candidate) -> Proposal:
     """A guess, drawn to where surfaces meet, and what the pictures say there."""
     shift = guess.other_from_own.matrix
+    about = shift[:3, 3]
     for reach_m in _REACHES_M:
         fit = target.fit(
             Surfels.joined([place.keyframe.coarse.moved(shift @ place.pose) for place in asked if place.keyframe]),
             reach_m,
         )
-        hessian, gradient = fit.equations(shift[:3, 3])
+        about = shift[:3, 3]
+        hessian, gradient = fit.equations(about)
         level, height = 1.0 / _TILT_RAD**2, 1.0 / _HEIGHT_M**2
         weight = np.diag([level, level, 1e-6, 1e-6, 1e-6, height])
         shift = nudged(shift, np.asarray(-np.linalg.solve(hessian + weight, gradient + weight @ unlevel(shift))))
     seen, samples, alike = _compared(asked, known, shift)
-    hessian, _ = fit.knowledge(shift[:3, 3])
+    information, _ = fit.information(about)
     keep = np.ix_([3, 4, 2], [3, 4, 2])
-    covariance = np.asarray(DOUBT * np.linalg.inv(hessian + weight)[keep], np.float64)
+    covariance = np.asarray(np.linalg.inv(information + weight)[keep], np.float64)
     return Proposal(planar(shift), guess.score, _likeness(seen), seen.told / max(1, samples), covariance, alike)
 
 

@@ -65,7 +65,7 @@ def without_specks(places: Sequence[Place]) -> list[Place]:
         else:
             before = kept[-1]
             there = moved(place, before.pose @ place.motion.matrix) if place.motion else place
-            kept.append(replace(there, group=before.group, linked=False, anchor=None, step=None))
+            kept.append(replace(there, group=before.group, linked=False, anchor=None, edges=None))
     return kept
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semslam.geometry.frames import SE2, Matrix
-from semslam.slam.surfel.alignment import Fit, Target, between, change_between, nudged, weakest
+from semslam.slam.surfel.alignment import Fit, Target, between, change_between, nudged, weakest_direction
 from semslam.slam.surfel.places import Keyframe
 from semslam.slam.surfel.sight import Agreement, agreement
 from semslam.slam.surfel.surfels import Surfels
@@ -53,6 +53,12 @@ _TOO_FEW = 0.04
 _MIN_MATCHES = 40
 _CLEARLY = 0.3
 """Standard deviations by which the mean difference of one pose is smaller than that of another that is worse."""
+_ASIDE_M = 0.1
+"""So far to either side pictures are compared to see whether edges hold a pose."""
+_CHANCE = 2.0
+"""By so much pictures may agree worse there without meaning anything."""
+_EDGES_M = 0.05
+"""Standard deviation of a place that edges tell, at best: so far apart are the places that the search looks at."""
 _WIDE_M, _WIDE_RAD = 0.2, 0.35
 """Standard deviations of motion above which pictures alone must tell where a robot is."""
 
@@ -63,9 +69,9 @@ class Found:
 
     pose: Matrix
     hessian: Floats
-    """(6, 6) of the surfaces alone."""
-    walls: bool
-    """Whether the surfaces are more than a floor."""
+    """(6, 6) information of the surfaces alone, for a turn about the pose's place and a shift, along the map's axes."""
+    on_floor: Floats
+    """(2, 2) information about x and y, along the axes of the map, that pictures have beyond surfaces: by edges."""
     sure: bool
     """Whether pictures alone would do to tell."""
     seen: Agreement
@@ -114,9 +120,18 @@ class Search:
         seen = self._agreement(pose)
         if len(fit) < _MIN_MATCHES or self._too_few(seen) or not seen.same_place(self._samples, sure=self._wide):
             return None
-        about = pose[:3, 3]
+        hessian, _ = fit.information(pose[:3, 3])
         sure = seen.same_place(self._samples, sure=True)
-        return Found(pose, fit.knowledge(about)[0], fit.shows_walls(about), sure, seen)
+        return Found(pose, hessian, self._edges(pose, hessian), sure, seen)
+
+    def _edges(self, pose: Matrix, hessian: Floats) -> Floats:
+        """(2, 2) what pictures alone tell of the place along the direction that surfaces hold worst: nothing, unless
+        they agree worse on either side."""
+        direction = weakest_direction(hessian + self._level)
+        aside = [nudged(pose, np.array([0.0, 0.0, 0.0, *(way * direction), 0.0])) for way in (-_ASIDE_M, _ASIDE_M)]
+        rise = min(self._disagreement(one) for one in aside) - self._disagreement(pose)
+        told = min(max(0.0, 2.0 * (rise - _CHANCE) / _ASIDE_M**2), _EDGES_M**-2)
+        return told * np.outer(direction, direction)
 
     def _starts(self) -> list[Matrix]:
         """Headings that agree best, none beside another; and, since only what is nearly right already agrees well, some
@@ -149,7 +164,7 @@ class Search:
         cost = self._cost(pose)
         for _ in range(_TIMES_BESIDE):
             hessian, _ = self._fit(pose, _REACH_M, coarse=True).equations(pose[:3, 3])
-            direction = weakest(hessian + self._level)
+            direction = weakest_direction(hessian + self._level)
             places = [nudged(pose, np.array([0.0, 0.0, 0.0, *(away * direction), 0.0])) for away in _BESIDE_M]
             best = min(places, key=self._cost)
             if self._cost(best) >= cost:
@@ -183,11 +198,15 @@ class Search:
 
     def _cost(self, pose: Matrix) -> float:
         """Of pictures that disagree and of motion that is unlikely."""
+        error = change_between(self._start, pose)
+        return self._disagreement(pose) + 0.5 * float(error @ self._motion @ error)
+
+    def _disagreement(self, pose: Matrix) -> float:
+        """Of pictures, as a negative log likelihood."""
         seen = self._agreement(pose)
         rest = max(0, self._samples - seen.looked_up)
         mean = (seen.difference + _STRANGE * seen.strangers + _NEUTRAL * rest) / max(1, self._samples)
-        error = change_between(self._start, pose)
-        return _WORTH * mean + 0.5 * float(error @ self._motion @ error)
+        return _WORTH * mean
 
     def _agreement(self, pose: Matrix) -> Agreement:
         whole = Agreement(0.0, 0)

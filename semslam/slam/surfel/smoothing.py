@@ -1,5 +1,5 @@
 """All keyframes of a log aligned with each other at once: surfaces seen twice tie any two keyframes, whenever they were
-taken, motion ties neighbours in time, and its steady error is one more unknown.
+taken, motion and edges in pictures tie neighbours in time, and the steady error of motion is one more unknown.
 
 Each round finds the pairs of keyframes that see most of the same, compares their surfels, and solves the normal
 equations of all poses together (gtsam, sparse Cholesky). Going round a room thereby closes the loop, and a first
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semslam.geometry.frames import SE2, Matrix
+from semslam.geometry.frames import SE2, Matrix, cross_matrix
 from semslam.slam.surfel.alignment import change_between, nudged, pair_equations
 from semslam.slam.surfel.comparisons import Comparison, Comparisons
 from semslam.slam.surfel.motion_prior import PAUSE_S, UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S, bias_sigmas, noise_sigmas
@@ -35,13 +35,8 @@ _LEAST_SHARED = 0.15
 """Share of the smaller one's voxels that two keyframes must have in common."""
 _MOST_SIGMAS = 5.0
 """Motion that is farther off than this has less than half of its weight (Cauchy): slipping wheels, a parked robot."""
-_STEP_M, _STEP_RAD = 0.05, 0.05
-"""Standard deviations of a step as it was found on the walk, along each axis and of the turn."""
 _STILL = 1e-3
 """Metres and radians of a change that is no improvement any more."""
-DOUBT = 3.0
-"""By how much less surfaces tell than their equations say, since neighbouring surfels err alike, and the same ones in
-many pairs: the squared Mahalanobis distance of the truth is then what it should be (benchmarks/calibration.py)."""
 _MOST_MARGINALS = 500
 """Poses whose covariance is worked out exactly: each takes longer, the more there are."""
 _FIXED = 1e8
@@ -145,7 +140,7 @@ def _equations(
         _level(equations, places, index, config)
         if index:
             _move(equations, before, index, config)
-            _step(equations, places, index)
+            _edges(equations, places, index)
         _anchor(equations, places, index)
     known = before.scale * bias_sigmas(config) ** 2
     equations.add((equations.bias,), np.diag(1.0 / known), before.bias / known)
@@ -198,8 +193,7 @@ def _tie(equations: _Equations, places: Sequence[Place], pair: tuple[int, int], 
     for laid, (source, target) in ((comparison.there, pair), (comparison.back, pair[::-1])):
         if laid:
             pose = places[target].pose
-            known = laid.hessian / DOUBT, laid.gradient / DOUBT
-            equations.add((source, target), *pair_equations(*known, laid.target_from_source, pose))
+            equations.add((source, target), *pair_equations(laid.hessian, laid.gradient, laid.target_from_source, pose))
     return comparison.ties
 
 
@@ -234,28 +228,30 @@ def _move(equations: _Equations, known: Smoothed, index: int, config: SurfelConf
     equations.add((index - 1, index, equations.bias), weighted @ jacobian, weighted @ error)
 
 
-def _step(equations: _Equations, places: Sequence[Place], index: int) -> None:
-    """The search on the walk chose between places where surfaces lie equally well by the edges in the pictures, which
-    surfaces know nothing of: it counts a little, where nothing else does."""
-    step = places[index].step
-    if step is None:
+def _edges(equations: _Equations, places: Sequence[Place], index: int) -> None:
+    """Edges in pictures, by which the walk chose between places where surfaces lie equally well."""
+    edges = places[index].edges
+    if edges is None or not edges.information.any():
         return
-    error, jacobian = _off(places[index - 1].pose, places[index].pose, step.matrix)
-    known = np.array([_STEP_RAD, _STEP_M, _STEP_M]) ** -2.0
-    doubt = 1.0 + float((error[2:5] ** 2 * known).sum()) / _MOST_SIGMAS**2
-    weighted = jacobian.T * np.array([0.0, 0.0, *(known / doubt), 0.0])
+    before = places[index - 1].pose
+    error, jacobian = _off(before, places[index].pose, edges.before_from_robot.matrix)
+    told = before[:2, :2] @ edges.information @ before[:2, :2].T
+    doubt = 1.0 + float(error[3:5] @ told @ error[3:5]) / _MOST_SIGMAS**2
+    weight = np.zeros((6, 6))
+    weight[3:5, 3:5] = told / doubt
+    weighted = jacobian.T @ weight
     equations.add((index - 1, index), weighted @ jacobian, weighted @ error)
 
 
 def _anchor(equations: _Equations, places: Sequence[Place], index: int) -> None:
-    """A keyframe whose pictures were not kept stays where it was found beside its anchor."""
+    """A keyframe whose pictures were not kept stays where it was found beside its anchor, as far as surfaces told."""
     anchor, pose = places[index].anchor, places[index].pose
     if anchor is None:
         return
     known = places[anchor.index].pose
     error, jacobian = _off(known, pose, anchor.anchor_from_robot)
     turn = np.kron(np.eye(2), known[:3, :3])
-    weighted = jacobian.T @ turn @ (anchor.hessian / DOUBT) @ turn.T
+    weighted = jacobian.T @ turn @ anchor.hessian @ turn.T
     equations.add((anchor.index, index), weighted @ jacobian, weighted @ error)
 
 
@@ -263,9 +259,8 @@ def _off(first: Matrix, second: Matrix, first_from_second: Matrix) -> tuple[Floa
     """(6,) how far a pose is from where another and the way between them put it, and (6, 12) how that depends on
     changes of both."""
     error = change_between(first @ first_from_second, second)
-    x, y, z = first[:3, :3] @ first_from_second[:3, 3]
     jacobian = np.concatenate([-np.eye(6), np.eye(6)], 1)
-    jacobian[3:, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    jacobian[3:, :3] = cross_matrix(first[:3, :3] @ first_from_second[:3, 3])
     return error, jacobian
 
 

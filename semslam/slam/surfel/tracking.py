@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from semslam.geometry.frames import SE2, Matrix, planar
 from semslam.slam.health import JUMP_M, JUMP_M_PER_S
-from semslam.slam.surfel.alignment import between, rotation_vector
+from semslam.slam.surfel.alignment import between, rotation_vector, shows_wall, told_of
 from semslam.slam.surfel.coverage import Coverage
 from semslam.slam.surfel.motion_prior import PAUSE_S, Expected, MotionPrior
-from semslam.slam.surfel.places import Anchor, Keyframe, Place, placed, shared_voxels
+from semslam.slam.surfel.places import Anchor, Edges, Keyframe, Place, placed, shared_voxels
 from semslam.slam.surfel.search import Found, Search
 from semslam.slam.surfel.sight import agreement
 from semslam.slam.surfel.uncertainty import along, grown
@@ -47,7 +47,7 @@ class Track:
         self.places: list[Place] = []
         self.prior = MotionPrior(config)
         self.open = np.zeros((3, 3))
-        """Covariance of what motion alone has told since a pose was seen, along the axes of the map."""
+        """Covariance of what motion alone has told, and pictures have not, along the axes of the map."""
         self.parked = False
         """Whether the robot may have been parked, and carried away, since then."""
         self.group = 0
@@ -81,21 +81,25 @@ class Track:
         found = self._found(keyframe, starts, opened)
         if found is None:
             return self._go_on(keyframe, start, seconds, motion, expected, opened)
-        if not found.walls:  # along a corridor motion tells the way; across it the walls do
-            self.open = opened
+        left_open = _left_open(opened, found)
+        if not shows_wall(found.hessian):
+            self.open = left_open
             return self._remember(keyframe, found.pose, seconds, motion, linked=False)
         if keyframe and (self.parked or _lost(opened)) and not self._seen_together(keyframe, found.pose):
             self.group += 1
-        self.open, self.parked = np.zeros((3, 3)), False
+        self.open, self.parked = left_open, False
         pose, hessian = found.pose, found.hessian
-        seen = None
+        edges = None
         if before.linked:
             seen = planar(between(before.pose, pose))
             self.prior.see(seen, seconds)
             if motion is not None and seconds <= PAUSE_S:
                 self.prior.learn(motion, seconds, seen, _covariance_in_robot(hessian, before.pose))
+            if before.group == self.group:
+                back = before.pose[:2, :2].T
+                edges = Edges(seen, back @ found.on_floor @ back.T)
         place = placed(keyframe, pose, seconds, motion, linked=True, group=self.group)
-        place = replace(place, step=seen if before.group == self.group else None)
+        place = replace(place, edges=edges)
         if keyframe and found.sure and (self._shown(keyframe, pose) or self._just_kept(pose, seconds)):
             place = self._left_out(place, hessian)
         self.recall(place)
@@ -129,7 +133,7 @@ class Track:
         turn = np.kron(np.eye(2), known[:3, :3])
         anchor = Anchor(nearest, between(known, place.pose), turn.T @ hessian @ turn)
         alone = placed(None, place.pose, place.seconds, place.motion, linked=True, group=place.group)
-        return replace(alone, anchor=anchor, step=place.step)
+        return replace(alone, anchor=anchor, edges=place.edges)
 
     def _go_on(
         self,
@@ -207,5 +211,13 @@ def _lost(covariance: Floats) -> bool:
 
 def _covariance_in_robot(hessian: Floats, before: Matrix) -> Floats:
     """(3, 3) of x, y and heading along the axes of the pose before."""
-    whole = np.linalg.inv(hessian + np.diag([1e4, 1e4, 1e2, 1e1, 1e1, 1e4]))[np.ix_([3, 4, 2], [3, 4, 2])]
-    return along(np.asarray(whole), before.T)
+    upright = np.diag([1e4, 1e4, 1.0, 1e-2, 1e-2, 1e4])
+    return along(np.asarray(np.linalg.inv(told_of(hessian + upright, (3, 4, 2)))), before.T)
+
+
+def _left_open(opened: Floats, found: Found) -> Floats:
+    """(3, 3) what a pose that was found leaves open of what motion did: along a corridor motion tells the way, across
+    it the walls do."""
+    told = told_of(found.hessian + np.diag([1e4, 1e4, 0.0, 0.0, 0.0, 1e4]), (3, 4, 2))
+    told[:2, :2] += found.on_floor
+    return np.asarray(opened @ np.linalg.inv(np.eye(3) + told @ opened))
