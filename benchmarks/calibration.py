@@ -54,9 +54,10 @@ def main() -> None:
     print("\n| logs | poses | mean | median | 95 % | most |\n" + "|---" * 6 + "|")
     found: list[Told] = []
     for out, homes in zip(args.folders[::2], args.folders[1::2], strict=True):
-        known = {log: list(poses(out, homes, log)) for log in run_tables(out, (POSES,))}
+        files = {log: tables.get(POSES.name) for log, tables in run_tables(out, (POSES,), variant="surfel").items()}
+        known = {log: list(poses(paths, homes, log)) for log, paths in files.items() if paths}
         whole = [one for told in known.values() for one in told]
-        print(line(f"{len(known)} of {homes.name}", whole), flush=True)
+        print(line(f"{len(known)} of {len(files)} of {homes.name}", whole), flush=True)
         found += whole
     print(line("all", found))
     print("\n| 95 % region, in bounds | poses | within bounds |\n|---|---|---|")
@@ -65,12 +66,12 @@ def main() -> None:
         print(f"| {low:g} to {high:g} | {len(chosen)} | {f'{np.mean(chosen):.1%}' if chosen else '-'} |")
 
 
-def poses(out: Path, homes: Path, log: str) -> Iterator[Told]:
+def poses(files: Sequence[Path], homes: Path, log: str) -> Iterator[Told]:
     """Those of a log but for the first, which is the map's frame."""
     config = LocalizeConfig()
     true = true_track(homes, log).by_stamp()
     start = true[min(true)]
-    rows = TableFiles(POSES, run_tables(out, (POSES,), [log], "surfel")[log][POSES.name]).read(COLUMNS)
+    rows = TableFiles(POSES, files).read(COLUMNS)
     for stamp, x, y, heading, error in list(zip(*rows.values(), strict=True))[1:]:
         if x is None or not error:
             continue
@@ -95,8 +96,8 @@ def width(estimate: PoseEstimate, config: LocalizeConfig) -> float:
 def line(name: str, told: Sequence[Told]) -> str:
     """A row."""
     values = [one.surprise for one in told]
-    cells = np.mean(values), np.median(values), np.percentile(values, 95), max(values)
-    return " | ".join([f"| {name}", str(len(told)), *(f"{cell:.2f}" for cell in cells)]) + " |"
+    cells = [np.mean(values), np.median(values), np.percentile(values, 95), max(values)] if values else []
+    return " | ".join([f"| {name}", str(len(told)), *([f"{cell:.2f}" for cell in cells] or ["-"] * 4)]) + " |"
 
 
 if __name__ == "__main__":

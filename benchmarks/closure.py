@@ -24,13 +24,14 @@ from machine import machine
 from numpy.typing import NDArray
 
 from semslam.bench.peers import Keyframe, keyframes
-from semslam.geometry.frames import SE2, planar
+from semslam.geometry.frames import SE2, invert, planar
 from semslam.metrics import Track
 from semslam.pipeline.run_tables import run_tables
 from semslam.tables.parquet import TableFiles
 from semslam.tables.spec import FRAMES, MOTION, TRUTH
 
 VOXEL_M, REACH_M = 0.04, 0.15
+COLUMNS = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")
 
 Matrix = NDArray[np.float64]
 
@@ -54,9 +55,6 @@ def main() -> None:
             print(f"| {log} | x {focal:g} | {len(rounds)} | {middle(rounds)} | {middle(beside)} |", flush=True)
 
 
-COLUMNS = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")
-
-
 def zoomed(frame: Keyframe, focal: float) -> Keyframe:
     """As if its camera had another focal length."""
     fx, fy, cx, cy = frame.intrinsics
@@ -75,13 +73,15 @@ def compared(frames: Sequence[Keyframe], truth: dict[int, SE2]) -> tuple[list[SE
         return np.asarray(found.T_target_source)
 
     steps = [aligned(index, index + 1) for index in range(len(frames) - 1)]
-    rounds = [planar(steps[i] @ steps[i + 1] @ np.linalg.inv(aligned(i, i + 2))) for i in range(len(frames) - 2)]
+    rounds = [planar(steps[i] @ steps[i + 1] @ invert(aligned(i, i + 2))) for i in range(len(frames) - 2)]
     beside = [poses[i].between(poses[i + 1]).between(planar(step)) for i, step in enumerate(steps)]
     return rounds, beside
 
 
 def middle(away: Sequence[SE2]) -> str:
     """Medians."""
+    if not away:
+        return "-"
     metres, degrees = zip(*sizes(away), strict=True)
     return f"{np.median(metres):.3f} m, {np.median(degrees):.2f} deg"
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semslam.geometry.frames import SE2
+from semslam.geometry.frames import SE2, wrap_angles
 
 _FLOATS = NDArray[np.float64]
 _DRAWS = 1000
@@ -82,7 +82,7 @@ def errors(truth: Track, estimate: Track) -> Errors:
     if not len(rows):
         return Errors(frames, np.zeros(0), np.zeros(0))
     expected, found = _from_first(truth, true_rows), _from_first(estimate, rows)
-    turn = np.degrees(np.abs(_wrapped(found[2] - expected[2])))
+    turn = np.degrees(np.abs(wrap_angles(found[2] - expected[2])))
     return Errors(frames, np.hypot(*(found[:2] - expected[:2])), turn)
 
 
@@ -119,10 +119,6 @@ def _from_first(track: Track, rows: NDArray[Any]) -> _FLOATS:
     cosine, sine = math.cos(heading[0]), math.sin(heading[0])
     x, y = x - x[0], y - y[0]
     return np.stack([cosine * x + sine * y, cosine * y - sine * x, heading - heading[0]])
-
-
-def _wrapped(angle_rad: _FLOATS) -> _FLOATS:
-    return np.asarray(np.remainder(angle_rad + math.pi, math.tau) - math.pi)
 
 
 def standstill(truth: Track) -> Score:
@@ -162,5 +158,5 @@ def _random_errors(truth: Track, map_half_m: float, seed: int) -> tuple[_FLOATS,
     random = np.random.default_rng(seed)
     place = random.uniform(-map_half_m, map_half_m, (2, _DRAWS, frames))
     heading = random.uniform(-math.pi, math.pi, (_DRAWS, frames))
-    turn = np.degrees(np.abs(_wrapped(heading - expected[2])))
+    turn = np.degrees(np.abs(wrap_angles(heading - expected[2])))
     return np.hypot(*(place - expected[:2, None])), turn

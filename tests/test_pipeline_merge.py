@@ -242,11 +242,13 @@ def test_a_site_is_a_folder_with_a_map_and_the_tracks(run: World, capsys: Captur
     assert {**again, "cached": False} == told
     assert run_command(["verify", str(run.out)], SURFEL_STAGES) == 0
     (folder / "monday" / "map.png").write_bytes(b"scribbled over")
-    (folder / "monday" / "map.yaml").unlink()
+    (folder / "monday" / "map.yaml").unlink()  # a link that leads nowhere is missing, too
+    (folder / "monday" / "map.yaml").symlink_to("nowhere")
     capsys.readouterr()
     assert run_command(["verify", str(run.out)], SURFEL_STAGES) == 1
     said = capsys.readouterr().out
     assert f"{folder / 'monday' / 'map.png'}: damaged" in said
+    assert "2 findings" in said
     assert f"{folder / 'monday' / 'map.yaml'}: missing; `semslam merge {run.out}` makes it anew" in said
     assert run_command(["merge", str(run.out), "--quiet"], SURFEL_STAGES) == 0
     assert contents(folder) == first
@@ -268,7 +270,7 @@ def test_an_interrupted_merge_leaves_nothing_half_written(
 
     monkeypatch.setattr(merge_module, "write_site", write)
     assert run_command(["merge", str(run.out), "--quiet"], SURFEL_STAGES) == 130
-    assert capsys.readouterr().err.splitlines()[-1] == "interrupted: nothing was changed; the same command starts anew"
+    assert capsys.readouterr().err.splitlines()[-1] == "interrupted: the same command starts anew"
     assert contents(run.out / "sites") == before
     assert not list(run.out.glob(".tmp-*"))
 

@@ -450,7 +450,8 @@ def merge(
     try:
         report = merge_run(MergeRequest(open_folder(out), logs, into), _stages(context), view.progressed)
     except KeyboardInterrupt:
-        _complain("interrupted: nothing was changed; the same command starts anew")
+        view.close()
+        _complain("interrupted: the same command starts anew")
         context.exit(INTERRUPTED)
     finally:
         view.close()

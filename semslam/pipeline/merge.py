@@ -20,7 +20,7 @@ from semslam.geometry.frames import SE2
 from semslam.pipeline.cache import Entry, EntryIndex, key_of
 from semslam.pipeline.config import Config, load_config, plain
 from semslam.pipeline.folder import OutputFolder
-from semslam.pipeline.merge_folder import MERGE_VERSION, mark, notes_of, recover, refuse, replacing, untouched
+from semslam.pipeline.merge_folder import MERGE_VERSION, mark, notes_of, recover, refuse, replacing, untouched, writing
 from semslam.pipeline.merge_view import LogRow, MergeReport
 from semslam.pipeline.plan import library_version
 from semslam.pipeline.record import LogRecord, load_records, task_name
@@ -142,10 +142,11 @@ def _merged(
         grid, drives = _drives(sources)
         sites = merge(drives, grid, settings[first].localize.surfel, watch)
         style = SiteStyle(ESTIMATOR, grid, settings[first].export)
-        warnings = list(_write_sites(temporary, sites, tracks, settings[first].localize, style))
         rows = [row for site in sites for row in _rows(site)]
-        write_table(temporary / "sites.parquet", SITES, _columns(rows))
-        mark(temporary, key, warnings)
+        with writing(target):
+            warnings = list(_write_sites(temporary, sites, tracks, settings[first].localize, style))
+            write_table(temporary / "sites.parquet", SITES, _columns(rows))
+            mark(temporary, key, warnings)
     return MergeReport(target, tuple(rows), (*notes, *warnings), cached=False)
 
 

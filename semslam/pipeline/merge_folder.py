@@ -7,7 +7,7 @@ is put back if it was cut short.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from semslam.pipeline.folder import OutputFolder
 
 MARK = "merge.json"
 MERGE_FORMAT = "semslam-sites"
-MERGE_VERSION = 2
+MERGE_VERSION = 3
 """Rises whenever the same logs give other files."""
 
 
@@ -31,9 +31,6 @@ def replacing(target: Path) -> Iterator[Path]:
     try:
         yield temporary
         _put(temporary, target)
-    except OSError as error:
-        error.filename = error.filename or str(target)
-        raise
     finally:
         remove(temporary)
 
@@ -49,26 +46,43 @@ def untouched(folder: Path, key: str) -> bool:
     known = read_json(folder / MARK)
     if not isinstance(known, dict) or known.get("key") != key or not isinstance(known.get("warnings"), list):
         return False
-    return known.get("files") == dict(_digests(folder))
+    return not any(changed(folder, lambda _: None, ""))
 
 
-def changed(folder: Path) -> Iterator[tuple[Path, str]]:
-    """Files of a finished folder that are not what was written, and what is wrong with each; none if no merge wrote
-    there."""
+@contextmanager
+def writing(target: Path) -> Iterator[None]:
+    """Errors of writing that name no file, such as that of a full disk, name the folder."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        error.filename = error.filename or str(target)
+        raise
+
+
+def changed(folder: Path, seen: Callable[[int], None], again: str) -> Iterator[tuple[Path, str]]:
+    """Files of a finished folder that are not what was written, what is wrong with each, and what to do; none of a
+    folder that is not there. `again` is the command that merges, `seen` is told the bytes of every block."""
     known = read_json(folder / MARK)
-    if not (folder / MARK).exists():
+    files = known.get("files") if isinstance(known, dict) else None
+    if not isinstance(files, dict):
+        if any(files_below(folder)):
+            yield folder / MARK, f"missing or damaged; remove the folder, then `{again}`"
         return
-    if not isinstance(known, dict) or not isinstance(known.get("files"), dict):
-        yield folder / MARK, "damaged"
-        return
-    written, found = known["files"], dict(_digests(folder))
-    for name in sorted({*written, *found}):
-        if name not in found:
-            yield folder / name, "missing"
-        elif name not in written:
-            yield folder / name, "nobody stored it here"
-        elif written[name] != found[name]:
-            yield folder / name, "damaged: its content is not what was stored"
+    for name in sorted(files):
+        path = folder / name
+        if not path.is_file():
+            yield path, f"missing; `{again}` makes it anew"
+        else:
+            try:
+                if sha256_file(path, seen) != files[name]:
+                    yield path, f"damaged: its content is not what was stored; `{again}` makes it anew"
+            except OSError as error:
+                yield path, f"cannot be read: {error.strerror}"
+    for path in files_below(folder):
+        if path != folder / MARK and str(path.relative_to(folder)) not in files:
+            yield path, "nobody stored it here; move it elsewhere"
 
 
 def notes_of(folder: Path) -> list[str]:

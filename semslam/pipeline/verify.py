@@ -2,7 +2,7 @@
 
 Checked: the digest that each manifest carries of itself, its key against its components, the chain of its shards, size
 and SHA-256 of every file, files that should not be there, results against the entries they were copied from, whether
-every result that a log refers to exists, and the folder of a merge.
+every result that a log refers to exists, and `sites`, the folder of a merge.
 """
 
 from __future__ import annotations
@@ -122,14 +122,16 @@ def verify(folder: OutputFolder, seen: Callable[[int], None]) -> VerifyReport:
     folders = list(entry_folders(folder.cache))
     findings = [finding for path in folders for finding in _check_entry(path, seen)]
     findings += _check_records(folder)
-    findings += _check_sites(folder)
-    files = sum(1 for path in folders for _ in files_below(path))
+    again = f"semslam merge {folder.root}"
+    findings += [Finding(str(path), what) for path, what in changed(folder.sites, seen, again)]
+    files = sum(1 for path in (*folders, folder.sites) for _ in files_below(path))
     return VerifyReport(len(folders), files, 0, tuple(findings))
 
 
 def stored_bytes(folder: OutputFolder) -> int:
     """Bytes that `verify` will read."""
-    return sum(size_bytes(path) for path in entry_folders(folder.cache))
+    sites = size_bytes(folder.sites) if folder.sites.is_dir() else 0
+    return sites + sum(size_bytes(path) for path in entry_folders(folder.cache))
 
 
 def drop_damaged(report: VerifyReport) -> int:
@@ -202,12 +204,6 @@ def _check_records(folder: OutputFolder) -> Iterator[Finding]:
                 yield Finding(f"{name} {task}", "its result is gone or damaged; the next run makes it anew")
             elif entry is not None and (folder.results / name / variant).is_dir():
                 yield from _check_results(folder, name, variant, entry)
-
-
-def _check_sites(folder: OutputFolder) -> Iterator[Finding]:
-    """What a merge wrote beside the results."""
-    for path, what in changed(folder.sites):
-        yield Finding(str(path), f"{what}; `semslam merge {folder.root}` makes it anew")
 
 
 def _check_results(folder: OutputFolder, log: str, variant: str, entry: Entry) -> Iterator[Finding]:

@@ -28,13 +28,12 @@ def map_server_files(cells: LayerCells, free: float, occupied: float) -> dict[st
 
 
 def map_server_doubt(cells: LayerCells) -> str:
-    """Why these files are left out, or are of no use; nothing if they are there and show something."""
-    known = cells.known
-    if not known.any():
+    """Why these files are left out, or are of no use; nothing if they are there and anything is known."""
+    box = _box(cells)
+    if box is None:
         seen = f"{cells.keyframes:,} keyframes up to {cells.columns.reach_m:g} m (`export.layer_depth_m`)"
         return f"Depth of {seen} shows nothing free or occupied: `map.pgm` is one unknown cell"
-    columns, rows = (int(np.ptp(axis[known])) + 1 for axis in (cells.ix, cells.iy))
-    if columns * rows <= MAX_PIXELS:
+    if box[2] * box[3] <= MAX_PIXELS:
         return ""
     return (
         f"The map spans more than {MAX_PIXELS:,} cells; `map.pgm` and `map.yaml` were left out. "
@@ -51,18 +50,25 @@ def occupancy_image(
     box has more than `MAX_PIXELS` cells; an empty map is one unknown cell, because map_server refuses pictures without
     pixels.
     """
-    known = cells.known
-    ix, iy, occupancy = cells.ix[known], cells.iy[known], cells.occupancy[known]
-    if not ix.size:
+    box = _box(cells)
+    if box is None:
         return np.full((1, 1), unknown, np.uint8), (0.0, 0.0)
-    left, low = int(ix.min()), int(iy.min())
-    columns, rows = int(ix.max()) - left + 1, int(iy.max()) - low + 1
+    left, low, columns, rows = box
     if columns * rows > MAX_PIXELS:
         return None
+    ix, iy, occupancy = (field[cells.known] for field in (cells.ix, cells.iy, cells.occupancy))
     image = np.full((rows, columns), unknown, np.uint8)
     image[iy - low, ix - left] = np.where(occupancy > occupied, _OCCUPIED, np.where(occupancy < free, _FREE, unknown))
     cell_m = cells.columns.cell_m
     return np.ascontiguousarray(image[::-1]), (left * cell_m, low * cell_m)
+
+
+def _box(cells: LayerCells) -> tuple[int, int, int, int] | None:
+    """Left column, lowest row, columns and rows of the cells whose occupancy is known; None if there are none."""
+    ix, iy = cells.ix[cells.known], cells.iy[cells.known]
+    if not ix.size:
+        return None
+    return int(ix.min()), int(iy.min()), int(np.ptp(ix)) + 1, int(np.ptp(iy)) + 1
 
 
 def unknown_grey(free_threshold: float, occupied_threshold: float) -> int:

@@ -51,7 +51,7 @@ class LayerCells:
     views: NDArray[np.uint32]
     columns: Columns
     keyframes: int
-    """Whose depth was taken up."""
+    """In whose depth anything was near enough."""
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -137,7 +137,7 @@ class Layers:
                     if place not in self._tiles:
                         self._tiles[place] = _Tile(self._columns)
                     self._tiles[place].take(window, sight, part)
-        self._keyframes += 1
+            self._keyframes += 1
         return True
 
     def cells(self) -> LayerCells:

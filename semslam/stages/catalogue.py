@@ -56,7 +56,7 @@ LOCALIZE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=3,
+    version=4,
     config=ExportConfig,
     reads=(POSES, CELLS, PLACES, FRAMES, DETECTIONS),
     writes=(TRAJECTORY, OBJECTS, LAYERS),

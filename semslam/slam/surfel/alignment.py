@@ -27,6 +27,8 @@ _OUTLIER = 2.5
 DOUBT = 3.0
 """By how much less surfaces tell than their equations say, since neighbouring surfels err alike, and the same ones in
 many pairs: the squared Mahalanobis distance of the truth is then what it should be (benchmarks/calibration.py)."""
+_WARY = 1.5
+"""So many times what the noise of normals is expected to tell is left out, since by chance it may have told more."""
 _HELD_M = 0.1
 """Standard deviation along one direction of the floor that surfaces must leave at most to be a wall."""
 _TINY, _LEAST = 1e-12, 1e-12
@@ -170,7 +172,7 @@ def _without_spurious(spurious: Floats, hessian: Floats, gradient: Floats) -> tu
     lower = np.linalg.cholesky(hessian / np.outer(scale, scale) + _TINY * np.eye(6)) * scale[:, None]
     inverse = np.linalg.inv(lower)
     shares, ways = np.linalg.eigh(inverse @ spurious @ inverse.T)
-    kept = np.maximum(0.0, 1.0 - shares)
+    kept = np.maximum(0.0, 1.0 - _WARY * shares)
     forth = lower @ ways
     return (forth * kept) @ forth.T, (forth * kept) @ (ways.T @ (inverse @ gradient))
 

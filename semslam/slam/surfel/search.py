@@ -45,9 +45,6 @@ _WORTH = 300.0
 _NEUTRAL = 0.9
 """What a sample counts that is not found again, in standard deviations: worse than one that is there, better than one
 that is not. So a pose from which little is seen of what is known must be all the more likely by motion."""
-_STRANGE = 6.0
-"""What a sample counts, beyond its difference, that hangs in space that was seen through: what is merely hidden may be
-so from elsewhere."""
 _TOO_FEW = 0.04
 """Share of samples that must be found again, or the pictures have nothing in common."""
 _MIN_MATCHES = 40
@@ -126,10 +123,13 @@ class Search:
 
     def _edges(self, pose: Matrix, hessian: Floats) -> Floats:
         """(2, 2) what pictures alone tell of the place along the direction that surfaces hold worst: nothing, unless
-        they agree worse on either side."""
+        what they have in common agrees worse on either side. How much that is tells nothing: it grows towards the other
+        picture's own place."""
         direction = weakest_direction(hessian + self._level)
         aside = [nudged(pose, np.array([0.0, 0.0, 0.0, *(way * direction), 0.0])) for way in (-_ASIDE_M, _ASIDE_M)]
-        rise = min(self._disagreement(one) for one in aside) - self._disagreement(pose)
+        here, *there = (self._agreement(one) for one in (pose, *aside))
+        worth = _WORTH * here.looked_up / max(1, self._samples)
+        rise = worth * (min(one.dissent for one in there) - here.dissent)
         told = min(max(0.0, 2.0 * (rise - _CHANCE) / _ASIDE_M**2), _EDGES_M**-2)
         return told * np.outer(direction, direction)
 
@@ -198,15 +198,11 @@ class Search:
 
     def _cost(self, pose: Matrix) -> float:
         """Of pictures that disagree and of motion that is unlikely."""
-        error = change_between(self._start, pose)
-        return self._disagreement(pose) + 0.5 * float(error @ self._motion @ error)
-
-    def _disagreement(self, pose: Matrix) -> float:
-        """Of pictures, as a negative log likelihood."""
         seen = self._agreement(pose)
         rest = max(0, self._samples - seen.looked_up)
-        mean = (seen.difference + _STRANGE * seen.strangers + _NEUTRAL * rest) / max(1, self._samples)
-        return _WORTH * mean
+        mean = (seen.dissent * seen.looked_up + _NEUTRAL * rest) / max(1, self._samples)
+        error = change_between(self._start, pose)
+        return _WORTH * mean + 0.5 * float(error @ self._motion @ error)
 
     def _agreement(self, pose: Matrix) -> Agreement:
         whole = Agreement(0.0, 0)

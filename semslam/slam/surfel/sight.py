@@ -36,6 +36,8 @@ _STRANGERS, _STRANGERS_SURE = 0.12, 0.05
 """Share of samples that hang in space that was seen through, up to which two pictures may show the same place: people
 walk. At right poses it is 0.01 in simulated homes and 0.04 in a real recording; at wrong ones, found in logs of robots
 that had been carried, 0.065 to 0.22."""
+_STRANGE = 6.0
+"""What a sample counts, beyond its difference, that hangs in space that was seen through."""
 _TOLD_SURE = 0.1
 """Share of samples that must be found again where nothing but the pictures speaks for a pose; of keyframes a second
 apart 0.15 to 0.6 are."""
@@ -58,6 +60,12 @@ class Agreement:
     def mean(self) -> float:
         """Difference of a sample; 3, the worst, where there was none."""
         return self.difference / self.looked_up if self.looked_up else _MOST
+
+    @property
+    def dissent(self) -> float:
+        """Difference of a sample, those that hang in seen-through space counting more: what is merely hidden may be so
+        from elsewhere. 0 without any."""
+        return (self.difference + _STRANGE * self.strangers) / max(1, self.looked_up)
 
     @property
     def told(self) -> int:
