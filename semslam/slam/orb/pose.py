@@ -19,6 +19,8 @@ LOOSE = 2.0
 """The guess from four points is coarse: its inliers may lie this many times farther off."""
 _ROUNDS, _STEPS = 4, 10
 """As in ORB-SLAM2: after each round the inliers are chosen anew."""
+_DIVERGED = 1e6
+"""Radians and metres of a step after which nothing is an inlier any more."""
 _TINY = 1e-9
 _NEAREST_M = 0.05
 
@@ -87,6 +89,8 @@ def fit_pose(sightings: Sightings, camera_from_map: Matrix, inlier_px: float, re
         robust = 2 * round_ < _ROUNDS
         for _ in range(_STEPS):
             step = _step(sightings, camera_from_map, inliers, inlier_px if robust else np.inf)
+            if not np.abs(step).max() < _DIVERGED:
+                break
             camera_from_map = _rigid(step[:3], step[3:]) @ camera_from_map
             if np.abs(step).max() < _TINY:
                 break
