@@ -249,7 +249,7 @@ def test_a_site_is_a_folder_with_a_map_and_the_tracks(run: World, capsys: Captur
     said = capsys.readouterr().out
     assert f"{folder / 'monday' / 'map.png'}: damaged" in said
     assert "2 findings" in said
-    assert f"{folder / 'monday' / 'map.yaml'}: missing; `semslam merge {run.out}` makes it anew" in said
+    assert f"{folder / 'monday' / 'map.yaml'}: missing; `semslam merge {run.out}`, with the `--log`" in said
     assert run_command(["merge", str(run.out), "--quiet"], SURFEL_STAGES) == 0
     assert contents(folder) == first
 

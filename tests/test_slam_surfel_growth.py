@@ -160,7 +160,7 @@ def test_a_wall_that_slides_is_no_better_for_showing_more() -> None:
     contradicted, worse = Agreement(100.0, 100, strangers=10), Agreement(120.0, 100)
 
     def found(seen: Agreement) -> Found:
-        return Found(np.eye(4), np.eye(6), np.zeros((2, 2)), sure=True, seen=seen)
+        return Found(np.eye(4), np.eye(6), 0, np.zeros((2, 2)), sure=True, seen=seen)
 
     assert not found(much).better_than(found(little))
     assert found(much).better_than(found(contradicted))

@@ -63,23 +63,22 @@ def writing(target: Path) -> Iterator[None]:
 
 def changed(folder: Path, seen: Callable[[int], None], again: str) -> Iterator[tuple[Path, str]]:
     """Files of a finished folder that are not what was written, what is wrong with each, and what to do; none of a
-    folder that is not there. `again` is the command that merges, `seen` is told the bytes of every block."""
+    folder that is not there. `again` names the command that merges, `seen` is told the bytes of every block."""
     known = read_json(folder / MARK)
     files = known.get("files") if isinstance(known, dict) else None
     if not isinstance(files, dict):
         if any(files_below(folder)):
-            yield folder / MARK, f"missing or damaged; remove the folder, then `{again}`"
+            yield folder / MARK, f"missing or damaged; remove the folder, then {again} makes it anew"
         return
     for name in sorted(files):
         path = folder / name
-        if not path.is_file():
-            yield path, f"missing; `{again}` makes it anew"
-        else:
-            try:
-                if sha256_file(path, seen) != files[name]:
-                    yield path, f"damaged: its content is not what was stored; `{again}` makes it anew"
-            except OSError as error:
-                yield path, f"cannot be read: {error.strerror}"
+        try:
+            if not path.is_file():
+                yield path, f"missing; {again} makes it anew"
+            elif sha256_file(path, seen) != files[name]:
+                yield path, f"damaged: its content is not what was stored; {again} makes it anew"
+        except OSError as error:
+            yield path, f"cannot be read: {error.strerror}"
     for path in files_below(folder):
         if path != folder / MARK and str(path.relative_to(folder)) not in files:
             yield path, "nobody stored it here; move it elsewhere"

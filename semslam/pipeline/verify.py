@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -122,7 +123,7 @@ def verify(folder: OutputFolder, seen: Callable[[int], None]) -> VerifyReport:
     folders = list(entry_folders(folder.cache))
     findings = [finding for path in folders for finding in _check_entry(path, seen)]
     findings += _check_records(folder)
-    again = f"semslam merge {folder.root}"
+    again = f"`semslam merge {folder.root}`, with the `--log` it was made with, if any,"
     findings += [Finding(str(path), what) for path, what in changed(folder.sites, seen, again)]
     files = sum(1 for path in (*folders, folder.sites) for _ in files_below(path))
     return VerifyReport(len(folders), files, 0, tuple(findings))
@@ -130,7 +131,9 @@ def verify(folder: OutputFolder, seen: Callable[[int], None]) -> VerifyReport:
 
 def stored_bytes(folder: OutputFolder) -> int:
     """Bytes that `verify` will read."""
-    sites = size_bytes(folder.sites) if folder.sites.is_dir() else 0
+    sites = 0
+    with suppress(OSError):  # what cannot be read is said later
+        sites = size_bytes(folder.sites) if folder.sites.is_dir() else 0
     return sites + sum(size_bytes(path) for path in entry_folders(folder.cache))
 
 

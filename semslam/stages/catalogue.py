@@ -45,7 +45,7 @@ EXTRACT = Stage(
 )
 LOCALIZE = Stage(
     "localize",
-    version=6,
+    version=7,
     config=LocalizeConfig,
     reads=(FRAMES, MOTION, OBSERVATIONS),
     writes=(POSES, SNAPSHOTS, CELLS, PLACES),

@@ -29,8 +29,9 @@ DOUBT = 3.0
 many pairs: the squared Mahalanobis distance of the truth is then what it should be (benchmarks/calibration.py)."""
 _WARY = 1.5
 """So many times what the noise of normals is expected to tell is left out, since by chance it may have told more."""
-_HELD_M = 0.1
-"""Standard deviation along one direction of the floor that surfaces must leave at most to be a wall."""
+_HELD_M = 0.03
+"""Standard deviation along one direction of the floor that surfaces must leave at most to be a wall: right poses leave
+0.002 to 0.015, and a wrong one at which little came to lie on anything left 0.08."""
 _TINY, _LEAST = 1e-12, 1e-12
 """Share of a Hessian that keeps parts of it solvable of which it says nothing; the least that it is taken to be."""
 _SHARED = 0.2

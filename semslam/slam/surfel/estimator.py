@@ -254,8 +254,10 @@ def _values(pose: SE2 | None) -> NDArray[np.float64]:
 
 
 def _told_by_edges(edges: Edges | None) -> NDArray[np.float64]:
-    """(7,), or empty for none."""
-    return np.array([]) if edges is None else np.append(_values(edges.before_from_robot), edges.information)
+    """(8,), or empty for none."""
+    if edges is None:
+        return np.array([])
+    return np.concatenate([[edges.index], _values(edges.other_from_robot), edges.information.ravel()])
 
 
 def _packed(place: Place, seen: Seen) -> bytes:
@@ -290,7 +292,7 @@ def _unpacked(packed: bytes) -> tuple[Place, Seen]:
     place = placed(keyframe, arrays["pose"], seconds, motion, linked=bool(linked), group=group)
     if arrays["edges"].size:
         values = arrays["edges"].tolist()
-        place = replace(place, edges=Edges(SE2(*values[:3]), np.array(values[3:]).reshape(2, 2)))
+        place = replace(place, edges=Edges(int(values[0]), SE2(*values[1:4]), np.array(values[4:]).reshape(2, 2)))
     if "anchor" in arrays:
         tied = Anchor(int(arrays["anchor"]), arrays["anchor_from_robot"], arrays["hessian"])
         place = replace(place, anchor=tied)

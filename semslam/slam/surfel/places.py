@@ -68,11 +68,14 @@ class Anchor:
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Where the search of the walk found a keyframe from the one before, and how surely by more than surfaces."""
+    """Where the search of the walk found a keyframe from another, and how surely by edges in both pictures along the
+    direction that surfaces hold worst."""
 
-    before_from_robot: SE2
+    index: int
+    """Of the other."""
+    other_from_robot: SE2
     information: Floats
-    """(2, 2) about x and y, along the axes of the keyframe before."""
+    """(2, 2) about x and y, along the axes of the other."""
 
 
 @dataclass(eq=False)
@@ -98,8 +101,8 @@ class Place:
     anchor: Anchor | None = None
     """Of one whose pictures were left out since they showed nothing new."""
     edges: Edges | None = None
-    """What edges tell of the way from the keyframe before; None where one of the two was not found on the walk, or in
-    another group, and in a log that is merged, whose track has it in it."""
+    """What edges tell; None of a keyframe that was not found on the walk, and in a log that is merged, whose track has
+    it in it."""
 
     @property
     def pictured(self) -> bool:

@@ -67,8 +67,11 @@ class Found:
     pose: Matrix
     hessian: Floats
     """(6, 6) information of the surfaces alone, for a turn about the pose's place and a shift, along the map's axes."""
+    reference: int
+    """Number of the known keyframe whose picture tells most by edges, and ..."""
     on_floor: Floats
-    """(2, 2) information about x and y, along the axes of the map, that pictures have beyond surfaces: by edges."""
+    """... (2, 2) what they tell of x and y from there, along the axes of the map: of the direction that surfaces hold
+    worst. Where surfaces hold it as well, they tell far more."""
     sure: bool
     """Whether pictures alone would do to tell."""
     seen: Agreement
@@ -119,19 +122,25 @@ class Search:
             return None
         hessian, _ = fit.information(pose[:3, 3])
         sure = seen.same_place(self._samples, sure=True)
-        return Found(pose, hessian, self._edges(pose, hessian), sure, seen)
+        return Found(pose, hessian, *self._edges(pose, hessian), sure, seen)
 
-    def _edges(self, pose: Matrix, hessian: Floats) -> Floats:
-        """(2, 2) what pictures alone tell of the place along the direction that surfaces hold worst: nothing, unless
-        what they have in common agrees worse on either side. How much that is tells nothing: it grows towards the other
-        picture's own place."""
+    def _edges(self, pose: Matrix, hessian: Floats) -> tuple[int, Floats]:
+        """Which reference tells most of the place along the direction that surfaces hold worst, and (2, 2) what:
+        nothing, unless what two pictures have in common agrees worse on either side. How much they have in common tells
+        nothing: it grows towards the other picture's own place."""
         direction = weakest_direction(hessian + self._level)
+        told = [self._told_by(number, pose, direction) for number in range(len(self._references))]
+        best = max(range(len(told)), key=lambda number: (told[number], -number))
+        return best, told[best] * np.outer(direction, direction)
+
+    def _told_by(self, number: int, pose: Matrix, direction: Floats) -> float:
+        """Information (1 / m^2) along a direction of the floor from the pictures of one reference."""
+        (other, place), own = self._references[number], self._keyframe.sight
         aside = [nudged(pose, np.array([0.0, 0.0, 0.0, *(way * direction), 0.0])) for way in (-_ASIDE_M, _ASIDE_M)]
-        here, *there = (self._agreement(one) for one in (pose, *aside))
-        worth = _WORTH * here.looked_up / max(1, self._samples)
+        here, *there = (agreement(other.sight, own, between(place, one)) for one in (pose, *aside))
+        worth = _WORTH * here.looked_up / max(1, len(other.sight.points) + len(own.points))
         rise = worth * (min(one.dissent for one in there) - here.dissent)
-        told = min(max(0.0, 2.0 * (rise - _CHANCE) / _ASIDE_M**2), _EDGES_M**-2)
-        return told * np.outer(direction, direction)
+        return min(max(0.0, 2.0 * (rise - _CHANCE) / _ASIDE_M**2), _EDGES_M**-2)
 
     def _starts(self) -> list[Matrix]:
         """Headings that agree best, none beside another; and, since only what is nearly right already agrees well, some

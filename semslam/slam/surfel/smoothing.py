@@ -1,5 +1,5 @@
 """All keyframes of a log aligned with each other at once: surfaces seen twice tie any two keyframes, whenever they were
-taken, motion and edges in pictures tie neighbours in time, and the steady error of motion is one more unknown.
+taken, edges in pictures tie some, motion ties neighbours in time, and the steady error of motion is one more unknown.
 
 Each round finds the pairs of keyframes that see most of the same, compares their surfels, and solves the normal
 equations of all poses together (gtsam, sparse Cholesky). Going round a room thereby closes the loop, and a first
@@ -231,16 +231,16 @@ def _move(equations: _Equations, known: Smoothed, index: int, config: SurfelConf
 def _edges(equations: _Equations, places: Sequence[Place], index: int) -> None:
     """Edges in pictures, by which the walk chose between places where surfaces lie equally well."""
     edges = places[index].edges
-    if edges is None or not edges.information.any():
+    if edges is None or not edges.information.any() or not _may_tie(places, edges.index, index):
         return
-    before = places[index - 1].pose
-    error, jacobian = _off(before, places[index].pose, edges.before_from_robot.matrix)
-    told = before[:2, :2] @ edges.information @ before[:2, :2].T
+    other = places[edges.index].pose
+    error, jacobian = _off(other, places[index].pose, edges.other_from_robot.matrix)
+    told = other[:2, :2] @ edges.information @ other[:2, :2].T
     doubt = 1.0 + float(error[3:5] @ told @ error[3:5]) / _MOST_SIGMAS**2
     weight = np.zeros((6, 6))
     weight[3:5, 3:5] = told / doubt
     weighted = jacobian.T @ weight
-    equations.add((index - 1, index), weighted @ jacobian, weighted @ error)
+    equations.add((edges.index, index), weighted @ jacobian, weighted @ error)
 
 
 def _anchor(equations: _Equations, places: Sequence[Place], index: int) -> None:

@@ -77,33 +77,37 @@ class Track:
         starts = [start]
         if seconds > PAUSE_S and motion is not None:  # a parked robot's odometry rests, and its errors with it
             starts += [before.pose @ motion.matrix, before.pose]
-        opened = grown(self.open, before.pose, start, expected.covariance)
+        so_far = np.zeros((3, 3)) if before.linked else self.open  # those before are known from each other
+        opened = grown(so_far, before.pose, start, expected.covariance)
         found = self._found(keyframe, starts, opened)
-        if found is None:
+        wall = found is not None and shows_wall(found.hessian)
+        if found is None or (_lost(opened) and not wall):  # one who is lost has floors everywhere
             return self._go_on(keyframe, start, seconds, motion, expected, opened)
         left_open = _left_open(opened, found)
-        if not shows_wall(found.hessian):
+        if not wall:
             self.open = left_open
             return self._remember(keyframe, found.pose, seconds, motion, linked=False)
         if keyframe and (self.parked or _lost(opened)) and not self._seen_together(keyframe, found.pose):
             self.group += 1
         self.open, self.parked = left_open, False
         pose, hessian = found.pose, found.hessian
-        edges = None
         if before.linked:
             seen = planar(between(before.pose, pose))
             self.prior.see(seen, seconds)
             if motion is not None and seconds <= PAUSE_S:
                 self.prior.learn(motion, seconds, seen, _covariance_in_robot(hessian, before.pose))
-            if before.group == self.group:
-                back = before.pose[:2, :2].T
-                edges = Edges(seen, back @ found.on_floor @ back.T)
         place = placed(keyframe, pose, seconds, motion, linked=True, group=self.group)
-        place = replace(place, edges=edges)
+        place = replace(place, edges=self._edges(found))
         if keyframe and found.sure and (self._shown(keyframe, pose) or self._just_kept(pose, seconds)):
             place = self._left_out(place, hessian)
         self.recall(place)
         return place
+
+    def _edges(self, found: Found) -> Edges:
+        """What edges tell of a pose that was found."""
+        other = self.places[found.reference].pose
+        back = other[:2, :2].T
+        return Edges(found.reference, planar(between(other, found.pose)), back @ found.on_floor @ back.T)
 
     def _shown(self, keyframe: Keyframe, pose: Matrix) -> bool:
         """Whether keyframes of this group show all that this one does."""
@@ -175,18 +179,20 @@ class Track:
         if keyframe is None:
             return None
         near = self._near(placed(keyframe, starts[0], 0.0, None, linked=False), linked=linked)
-        known = [(place.keyframe, place.pose) for place in near if place.keyframe]
+        known = {index: place.keyframe for index in near if (place := self.places[index]).keyframe}
         if not known:
             return None
-        return Search(keyframe, known, starts, covariance, self._config).result()
+        poses = [(other, self.places[index].pose) for index, other in known.items() if other]
+        found = Search(keyframe, poses, starts, covariance, self._config).result()
+        return found and replace(found, reference=list(known)[found.reference])
 
-    def _near(self, place: Place, *, linked: bool) -> list[Place]:
+    def _near(self, place: Place, *, linked: bool) -> list[int]:
         """The last place and those that see most of the same, best first, of those that are linked or not."""
         shared = shared_voxels(self.places, place)
         shared[self._last()] = len(place.voxels) + 1
         others = [index for index in shared if self.places[index].linked == linked]
         others.sort(key=lambda index: (-shared[index], index))
-        return [self.places[index] for index in others[: self._config.neighbours]]
+        return others[: self._config.neighbours]
 
     def _last(self) -> int:
         """The last place, or the one it is tied to."""
