@@ -26,8 +26,8 @@ from tests.slam_world import CELL_M, CLASSES, SIDE
 
 CONFIG = SurfelConfig(surfels=500, neighbours=4, rounds=4)
 GRID = Grid(tuple(CLASSES), CELL_M, SIDE)
-FLOOR_AND_WALL = Room(np.array([-50.0, -50.0, 0.0]), np.array([3.0, 50.0, 2.5]), np.zeros((0, 2, 3)))
-"""One wall, three metres before the robot, as far as one sees."""
+FLOOR_AND_WALL = Room(np.array([-50.0, -50.0, -0.05]), np.array([3.1, 50.0, 2.5]), np.zeros((0, 2, 3)))
+"""One wall, three metres before the robot, as far as one sees; not on the edges of voxels, where rounding decides."""
 BARE_FLOOR = Room(np.array([-50.0, -50.0, 0.0]), np.array([50.0, 50.0, 50.0]), np.zeros((0, 2, 3)))
 
 
@@ -123,15 +123,16 @@ def test_where_surfaces_are_blind_edges_count() -> None:
         start = matrix(SE2(0.02, 0.3, 0.0))
         places = [
             placed(first, np.eye(4), 0.0, None, linked=True),
-            replace(placed(second, start, 1.0, motion, linked=True), edges=edges),
+            placed(None, start, 1.0, SE2(0.02, 0.3, 0.0), linked=True),  # saw nothing: edges are not from here
+            replace(placed(second, start, 1.0, motion and SE2(0.0, 0.0, 0.0), linked=True), edges=edges),
         ]
         poses = [place.pose for place in smooth(places, np.zeros(3), CONFIG).places]
-        found = planar(between(*poses))
-        assert abs(found.x_m) < 0.01
+        found = planar(between(poses[0], poses[2]))
+        assert abs(found.x_m) < 0.03
         return found.y_m
 
     there = Edges(0, SE2(0.0, 0.2, 0.0), np.diag([0.0, 0.05**-2]))
-    assert aligned(None, there) == pytest.approx(0.2, abs=0.02)
+    assert aligned(None, there) == pytest.approx(0.2, abs=0.03)
     assert aligned(SE2(0.0, 0.3, 0.0), None) == pytest.approx(0.3, abs=0.01)
     assert 0.22 < aligned(SE2(0.0, 0.3, 0.0), there) < 0.29
 
@@ -149,6 +150,37 @@ def test_edges_tell_where_a_wall_does_not() -> None:
         told.append(float(np.trace(found.on_floor)))
     assert told[0] < 1.0
     assert told[1] > 50.0
+
+
+def test_edges_are_put_away_and_taken_up() -> None:
+    """With the keyframe that they were seen from."""
+    estimator = SurfelEstimator(CONFIG, GRID)
+    for step in observed(make_views(make_room(), make_drive(4), noise_m=0.02)):
+        estimator.step(step)
+    again = SurfelEstimator(CONFIG, GRID)
+    again.restore([estimator.part()])
+    told = [place.edges for place in estimator._track.places[1:]]
+    assert all(edges is not None and edges.information.any() for edges in told)
+    for edges, place in zip(told, again._track.places[1:], strict=True):
+        assert edges is not None
+        assert place.edges is not None
+        assert (place.edges.index, place.edges.other_from_robot) == (edges.index, edges.other_from_robot)
+        np.testing.assert_array_equal(place.edges.information, edges.information)
+
+
+def test_one_who_is_lost_over_bare_floor_stays_lost() -> None:
+    """Floors fit each other everywhere: what motion leaves open grows, and what is seen afterwards is another group."""
+    boards = np.array([[[2.5, y, 0.0], [2.6, y + 0.5, 2.0]] for y in (-3.0, -1.2, 0.4, 2.2, 4.0, 6.5)])
+    room = replace(FLOOR_AND_WALL, boxes=boards)
+    back = [SE2(0.0, 0.2 * number, math.pi) for number in range(25)]
+    drive = [*(SE2(0.0, 0.0, 0.0) for _ in range(2)), *back, SE2(0.0, 4.8, 0.0), SE2(0.0, 5.0, 0.0)]
+    steps = observed(make_views(room, drive))
+    estimator = SurfelEstimator(CONFIG, GRID)
+    for number, step in enumerate(steps):
+        estimator.step(replace(step, motion=None) if 2 <= number < len(steps) - 1 else step)
+    places = estimator._track.places
+    assert not any(place.linked for place in places[3:26])
+    assert not places[-1].linked or places[-1].group > 0 or abs(places[-1].pose[1, 3] - 5.0) < 0.3
 
 
 def test_what_motion_leads_to_moves_with_a_part_that_was_found() -> None:

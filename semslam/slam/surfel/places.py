@@ -101,8 +101,8 @@ class Place:
     anchor: Anchor | None = None
     """Of one whose pictures were left out since they showed nothing new."""
     edges: Edges | None = None
-    """What edges tell; None of a keyframe that was not found on the walk, and in a log that is merged, whose track has
-    it in it."""
+    """What edges tell; None of a keyframe that is not linked, whose reference is of another group, and in a log that is
+    merged, whose track has it in it."""
 
     @property
     def pictured(self) -> bool:

@@ -47,7 +47,8 @@ class Track:
         self.places: list[Place] = []
         self.prior = MotionPrior(config)
         self.open = np.zeros((3, 3))
-        """Covariance of what motion alone has told, and pictures have not, along the axes of the map."""
+        """Covariance of what motion has told, and pictures have not, since a keyframe was linked, along the axes of the
+        map; what walls left open before that is in the covariances of the alignment alone."""
         self.parked = False
         """Whether the robot may have been parked, and carried away, since then."""
         self.group = 0
@@ -103,8 +104,11 @@ class Track:
         self.recall(place)
         return place
 
-    def _edges(self, found: Found) -> Edges:
-        """What edges tell of a pose that was found."""
+    def _edges(self, found: Found) -> Edges | None:
+        """What edges tell of a pose that was found; None from a keyframe of another group, of which nobody knows where
+        it lies."""
+        if self.places[found.reference].group != self.group:
+            return None
         other = self.places[found.reference].pose
         back = other[:2, :2].T
         return Edges(found.reference, planar(between(other, found.pose)), back @ found.on_floor @ back.T)
@@ -150,7 +154,7 @@ class Track:
     ) -> Place:
         """Without a link to what is known: among keyframes that have none either, or as motion leads."""
         found = self._find(keyframe, [start], expected.covariance, linked=False)
-        if found is None:
+        if found is None or not shows_wall(found.hessian):
             self.open = opened
         self.parked |= seconds > PAUSE_S
         return self._remember(keyframe, start if found is None else found.pose, seconds, motion, linked=False)
