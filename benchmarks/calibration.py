@@ -50,6 +50,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+", type=Path, metavar="OUT HOMES")
     args = parser.parse_args()
+    if len(args.folders) % 2:
+        parser.error("name an output folder and its data set, in pairs")
     print(machine())
     print("\n| logs | poses | mean | median | 95 % | most |\n" + "|---" * 6 + "|")
     found: list[Told] = []

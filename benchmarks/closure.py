@@ -24,14 +24,13 @@ from machine import machine
 from numpy.typing import NDArray
 
 from semslam.bench.peers import Keyframe, keyframes
+from semslam.bench.tracks import track_of
 from semslam.geometry.frames import SE2, invert, planar
-from semslam.metrics import Track
 from semslam.pipeline.run_tables import run_tables
 from semslam.tables.parquet import TableFiles
 from semslam.tables.spec import FRAMES, MOTION, TRUTH
 
 VOXEL_M, REACH_M = 0.04, 0.15
-COLUMNS = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")
 
 Matrix = NDArray[np.float64]
 
@@ -48,7 +47,10 @@ def main() -> None:
         "\n| log | focal length | triangles | round a triangle | neighbours, beside the truth |\n|---|---|---|---|---|"
     )
     for log, tables in run_tables(args.out, (FRAMES, MOTION, TRUTH), args.log).items():
-        truth = Track.of(*TableFiles(TRUTH, tables[TRUTH.name]).read(COLUMNS).values()).by_stamp()
+        if TRUTH.name not in tables:
+            print(f"| {log} | no truth | - | - | - |")
+            continue
+        truth = track_of(TableFiles(TRUTH, tables[TRUTH.name])).by_stamp()
         frames = [one for one in keyframes(tables[FRAMES.name], tables[MOTION.name]) if one.stamp_nanos in truth]
         for focal in args.focal:
             rounds, beside = compared([zoomed(one, focal) for one in frames], truth)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -22,15 +23,14 @@ from typing import Any
 from machine import machine
 
 from semslam.bench.peers import installed, track
-from semslam.bench.tracks import column_track
-from semslam.metrics import Score, Track, score
+from semslam.bench.tracks import column_track, track_of
+from semslam.metrics import Score, score
 from semslam.pipeline.run_tables import run_tables
 from semslam.tables.parquet import TableFiles
 from semslam.tables.spec import FRAMES, MOTION, TRUTH
 
 PEERS = ("small_gicp", "kiss_icp", "pyorbslam3")
 ERRORS = ("ape_m", "de_deg", "ape_worst_m", "de_worst_deg")
-COLUMNS = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")
 
 
 def main() -> None:
@@ -54,10 +54,12 @@ def main() -> None:
 def peer_scores(run: Path, peer: str, logs: Sequence[str] | None = None) -> Iterator[tuple[str, Score]]:
     """A package on the logs of a run, one after the other."""
     for log, tables in run_tables(run, (FRAMES, MOTION, TRUTH), logs).items():
-        frames, motion, told = (tables[table.name] for table in (FRAMES, MOTION, TRUTH))
-        rows = TableFiles(TRUTH, told).read(COLUMNS)
-        truth = Track.of(*(rows[name] for name in COLUMNS))
-        arguments = {"peer": peer, "frames": frames, "motion": motion, "steps": len(rows["frame"])}
+        if TRUTH.name not in tables:
+            print(f"`{log}` has no truth", file=sys.stderr)
+            continue
+        truth = track_of(TableFiles(TRUTH, tables[TRUTH.name]))
+        frames, motion = tables[FRAMES.name], tables[MOTION.name]
+        arguments = {"peer": peer, "frames": frames, "motion": motion, "steps": len(truth.frames)}
         found = tracked(arguments)
         yield (
             log,

@@ -147,7 +147,7 @@ def test_edges_tell_where_a_wall_does_not() -> None:
         search = Search(other, [(one, np.eye(4))], [start], np.diag([0.05**2, 0.05**2, 0.03**2]), CONFIG)
         found = search.result()
         assert found is not None
-        told.append(float(np.trace(found.on_floor)))
+        told.append(float(np.trace(found.edge_information)))
     assert told[0] < 1.0
     assert told[1] > 50.0
 

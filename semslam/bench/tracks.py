@@ -30,6 +30,8 @@ from semslam.stages.settings import PaperConfig
 from semslam.tables.parquet import TableFiles, made_by
 from semslam.tables.spec import POSES, TRAJECTORY, TRUTH, Table
 
+_TRACK = ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")
+
 
 @dataclass(frozen=True)
 class Pipeline:
@@ -136,17 +138,21 @@ class TrackScore:
 def true_track(dataset: Path, log: str, steps: int | None = None) -> Track:
     """The exact track of the first `steps` keyframes of a log, world_from_robot; None means all."""
     with made_by(simulating(dataset)):
-        rows = TableFiles(TRUTH, [dataset / "truth" / log / "truth.parquet"]).read()
-    if not rows["frame"]:
+        track = track_of(TableFiles(TRUTH, [dataset / "truth" / log / "truth.parquet"]), steps)
+    if not len(track.frames):
         raise SemslamError(f"The truth of `{log}` is empty", hint=f"simulate it again: `semslam simulate {dataset}`")
-    columns = [rows[name][:steps] for name in ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")]
-    return Track.of(*columns)
+    return track
+
+
+def track_of(table: TableFiles, steps: int | None = None) -> Track:
+    """The first `steps` rows of a table with the columns of a track, such as truth or trajectory; None means all."""
+    rows = table.read(_TRACK)
+    return Track.of(*(rows[name][:steps] for name in _TRACK))
 
 
 def published_track(folder: Path) -> Track:
     """The trajectory in a folder of results: `results/LOG/ESTIMATOR`, or `sites/SITE/LOG`."""
-    rows = TableFiles(TRAJECTORY, [folder / "trajectory.parquet"]).read()
-    return Track.of(*(rows[name] for name in ("frame", "stamp_nanos", "x_m", "y_m", "heading_rad")))
+    return track_of(TableFiles(TRAJECTORY, [folder / "trajectory.parquet"]))
 
 
 def stored_track(files: Sequence[Path], truth: Track) -> Track:

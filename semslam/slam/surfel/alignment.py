@@ -190,11 +190,11 @@ def weakest_direction(hessian: Floats) -> Floats:
 
 def _on_floor(hessian: Floats) -> tuple[Floats, Floats]:
     """Eigenvalues (2,), rising, and eigenvectors (2, 2) of what a Hessian (6, 6) tells of x and y alone."""
-    values, vectors = np.linalg.eigh(told_of(hessian, (3, 4)))
+    values, vectors = np.linalg.eigh(marginal_information(hessian, (3, 4)))
     return np.asarray(values), np.asarray(vectors)
 
 
-def told_of(hessian: Floats, keep: Sequence[int]) -> Floats:
+def marginal_information(hessian: Floats, keep: Sequence[int]) -> Floats:
     """Information about some of the six unknowns, whatever the others are (Schur complement)."""
     kept, rest = list(keep), [index for index in range(6) if index not in keep]
     others = hessian[np.ix_(rest, rest)] + np.diag(np.full(len(rest), _TINY * (1.0 + np.trace(hessian))))

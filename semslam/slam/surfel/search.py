@@ -69,7 +69,7 @@ class Found:
     """(6, 6) information of the surfaces alone, for a turn about the pose's place and a shift, along the map's axes."""
     reference: int
     """Number of the known keyframe whose picture tells most by edges, and ..."""
-    on_floor: Floats
+    edge_information: Floats
     """... (2, 2) what they tell of x and y from there, along the axes of the map: of the direction that surfaces hold
     worst. Where surfaces hold it as well, they tell far more."""
     sure: bool
@@ -129,11 +129,11 @@ class Search:
         nothing, unless what two pictures have in common agrees worse on either side. How much they have in common tells
         nothing: it grows towards the other picture's own place."""
         direction = weakest_direction(hessian + self._level)
-        told = [self._told_by(number, pose, direction) for number in range(len(self._references))]
+        told = [self._edge_information(number, pose, direction) for number in range(len(self._references))]
         best = max(range(len(told)), key=lambda number: (told[number], -number))
         return best, told[best] * np.outer(direction, direction)
 
-    def _told_by(self, number: int, pose: Matrix, direction: Floats) -> float:
+    def _edge_information(self, number: int, pose: Matrix, direction: Floats) -> float:
         """Information (1 / m^2) along a direction of the floor from the pictures of one reference."""
         (other, place), own = self._references[number], self._keyframe.sight
         aside = [nudged(pose, np.array([0.0, 0.0, 0.0, *(way * direction), 0.0])) for way in (-_ASIDE_M, _ASIDE_M)]

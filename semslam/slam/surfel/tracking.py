@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from semslam.geometry.frames import SE2, Matrix, planar
 from semslam.slam.health import JUMP_M, JUMP_M_PER_S
-from semslam.slam.surfel.alignment import between, rotation_vector, shows_wall, told_of
+from semslam.slam.surfel.alignment import between, marginal_information, rotation_vector, shows_wall
 from semslam.slam.surfel.coverage import Coverage
 from semslam.slam.surfel.motion_prior import PAUSE_S, Expected, MotionPrior
 from semslam.slam.surfel.places import Anchor, Edges, Keyframe, Place, placed, shared_voxels
@@ -111,7 +111,7 @@ class Track:
             return None
         other = self.places[found.reference].pose
         back = other[:2, :2].T
-        return Edges(found.reference, planar(between(other, found.pose)), back @ found.on_floor @ back.T)
+        return Edges(found.reference, planar(between(other, found.pose)), back @ found.edge_information @ back.T)
 
     def _shown(self, keyframe: Keyframe, pose: Matrix) -> bool:
         """Whether keyframes of this group show all that this one does."""
@@ -222,12 +222,12 @@ def _lost(covariance: Floats) -> bool:
 def _covariance_in_robot(hessian: Floats, before: Matrix) -> Floats:
     """(3, 3) of x, y and heading along the axes of the pose before."""
     upright = np.diag([1e4, 1e4, 1.0, 1e-2, 1e-2, 1e4])
-    return along(np.asarray(np.linalg.inv(told_of(hessian + upright, (3, 4, 2)))), before.T)
+    return along(np.asarray(np.linalg.inv(marginal_information(hessian + upright, (3, 4, 2)))), before.T)
 
 
 def _left_open(opened: Floats, found: Found) -> Floats:
     """(3, 3) what a pose that was found leaves open of what motion did: along a corridor motion tells the way, across
     it the walls do."""
-    told = told_of(found.hessian + np.diag([1e4, 1e4, 0.0, 0.0, 0.0, 1e4]), (3, 4, 2))
-    told[:2, :2] += found.on_floor
+    told = marginal_information(found.hessian + np.diag([1e4, 1e4, 0.0, 0.0, 0.0, 1e4]), (3, 4, 2))
+    told[:2, :2] += found.edge_information
     return np.asarray(opened @ np.linalg.inv(np.eye(3) + told @ opened))
